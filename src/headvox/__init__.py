@@ -1,0 +1,44 @@
+"""headvox finds human heads in 3-D point clouds and depth images: deterministic, real time, no neural network."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from headvox.data import BadFrame as BadFrame
+    from headvox.data import Cloud as Cloud
+    from headvox.data import DepthImage as DepthImage
+    from headvox.data import Frame as Frame
+    from headvox.data import Heads as Heads
+    from headvox.data import Intrinsics as Intrinsics
+    from headvox.errors import HeadvoxError as HeadvoxError
+    from headvox.pipeline import Detector as Detector
+    from headvox.sources import open_source as open_source
+
+# Names are imported when they are first used: `import headvox` must not wait for Numba.
+_HOME = {
+    "BadFrame": "headvox.data",
+    "Cloud": "headvox.data",
+    "DepthImage": "headvox.data",
+    "Detector": "headvox.pipeline",
+    "Frame": "headvox.data",
+    "Heads": "headvox.data",
+    "HeadvoxError": "headvox.errors",
+    "Intrinsics": "headvox.data",
+    "open_source": "headvox.sources",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'headvox' has no attribute '{name}'")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

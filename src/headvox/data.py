@@ -1,0 +1,115 @@
+"""What flows through headvox: frames in, heads out.
+
+Units are metres and nanoseconds. The world frame is right-handed with z up; camera frames are optical (x right,
+y down, z forward); a head frame is x out of the face, y to the person's left, z up through the crown.
+``T_a_b`` is a 4x4 matrix that maps coordinates in b to coordinates in a.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+U16 = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A pinhole depth camera without distortion.
+
+    ``fx fy cx cy`` are in pixels, pixel centres at whole numbers; metres = value * ``depth_scale``, 0 = no return.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    depth_scale: float = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class DepthImage:
+    """One depth image. ``depth`` is (height, width) uint16, C-contiguous; ``T_world_camera`` (4, 4) float64."""
+
+    name: str
+    depth: U16
+    intrinsics: Intrinsics
+    T_world_camera: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """One point cloud.
+
+    ``points`` is (N, 3) float32 in metres, C-contiguous, invalid points NaN. ``T_world_sensor`` is (4, 4) float64
+    and places the sensor's frame in the world; ``None`` says that the points are world coordinates already and that
+    nobody knows where the sensor stood.
+    """
+
+    name: str
+    points: F32
+    T_world_sensor: F64 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What all sensors saw at one moment: ``clouds`` and ``depths``, either of which may be empty."""
+
+    stamp_ns: int
+    clouds: tuple[Cloud, ...] = ()
+    depths: tuple[DepthImage, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BadFrame:
+    """A frame that a source could not read; the run reports and counts it, and goes on."""
+
+    stamp_ns: int
+    reason: str
+
+
+def _empty(*shape: int) -> F64:
+    return np.empty(shape, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Heads:
+    """The heads found in one frame, as a structure of arrays, best score first.
+
+    ``centres``     (N, 3) float64, metres, world frame
+    ``quaternions`` (N, 4) float64, x y z w, world from head; a row of NaN where the orientation is not known
+    ``radii``       (N,)   float64, metres, of the sphere that fits the skull
+    ``scores``      (N,)   float64, the cascade's score; higher is surer
+    """
+
+    centres: F64 = field(default_factory=lambda: _empty(0, 3))
+    quaternions: F64 = field(default_factory=lambda: _empty(0, 4))
+    radii: F64 = field(default_factory=lambda: _empty(0))
+    scores: F64 = field(default_factory=lambda: _empty(0))
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def __iter__(self) -> Iterator[Head]:
+        for centre, quaternion, radius, score in zip(
+            self.centres, self.quaternions, self.radii, self.scores, strict=True
+        ):
+            yield Head(centre, quaternion, float(radius), float(score))
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """One row of :class:`Heads`."""
+
+    centre: F64
+    quaternion: F64
+    radius: float
+    score: float

@@ -1,0 +1,19 @@
+"""The one exception the library raises for input it cannot use."""
+
+from __future__ import annotations
+
+
+class HeadvoxError(Exception):
+    """Input, configuration or files that headvox cannot use.
+
+    ``what`` is one line that says what was expected and what came; ``do`` is one line that says what to do
+    about it. The command line prints both and exits with 1; the library only raises.
+    """
+
+    def __init__(self, what: str, do: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.do = do
+
+    def __str__(self) -> str:
+        return f"{self.what} {self.do}".rstrip()

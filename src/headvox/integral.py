@@ -1,0 +1,92 @@
+"""Grid -> integral volume, and the sum over any box in eight look-ups.
+
+S[x, y, z] is the sum of the grid over all cells below x, y and z, so the sum over a half-open box is
+
+    S[x1, y1, z1] - S[x0, y1, z1] - S[x1, y0, z1] - S[x1, y1, z0]
+                  + S[x0, y0, z1] + S[x0, y1, z0] + S[x1, y0, z0] - S[x0, y0, z0]
+
+(Viola and Jones's summed-area table in 3-D). S is unsigned and wraps around: every box sum that fits the type is
+exact all the same, because the wraps cancel. So S can be half the size, and faster, than its largest entry asks for.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.kernels import kernel, rule
+
+PARTS = np.array([value.bit_count() for value in range(256)], dtype=np.uint8)
+
+Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
+
+
+@kernel
+def integrate(cells, box, counting, S):  # type: ignore[no-untyped-def]
+    """Fill ``S`` (bx+1, by+1, bz+1) with the integral volume of the cells in ``box``.
+
+    ``box`` is lowest and highest cell (inclusive) of the grid ``cells``. A parts grid is summed by its bits.
+    """
+    x0, y0, z0 = box[0], box[1], box[2]
+    nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
+    row = np.empty(nz + 1, S.dtype)
+    S[0] = 0
+    for x in range(nx):
+        row[:] = 0
+        S[x + 1, 0] = 0
+        for y in range(ny):
+            column = cells[x0 + x, y0 + y, z0 : z0 + nz]
+            if _any(column):
+                total = 0
+                for z in range(nz):
+                    total += column[z] if counting else PARTS[column[z] & 255]
+                    row[z + 1] += total
+            below = S[x, y + 1]
+            out = S[x + 1, y + 1]
+            for z in range(nz + 1):
+                out[z] = below[z] + row[z]
+
+
+@rule
+def _any(column):  # type: ignore[no-untyped-def]
+    bits = 0
+    for z in range(column.shape[0]):
+        bits |= column[z]
+    return bits != 0
+
+
+@rule
+def box_sum(S, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
+    """Return the sum over the half-open box, cut off at the edges of ``S``."""
+    nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
+    x0, x1 = min(max(x0, 0), nx), min(max(x1, 0), nx)
+    y0, y1 = min(max(y0, 0), ny), min(max(y1, 0), ny)
+    z0, z1 = min(max(z0, 0), nz), min(max(z1, 0), nz)
+    high = S[x1, y1, z1] - S[x0, y1, z1] - S[x1, y0, z1] + S[x0, y0, z1]
+    low = S[x1, y1, z0] - S[x0, y1, z0] - S[x1, y0, z0] + S[x0, y0, z0]
+    return high - low
+
+
+def integral_volume(cells: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
+    """Return the integral volume (nx+1, ny+1, nz+1) uint32 of a parts grid (uint8) or a count grid (uint32)."""
+    S = np.empty([n + 1 for n in cells.shape], dtype=np.uint32)
+    box = np.array([0, 0, 0, *(n - 1 for n in cells.shape)], dtype=np.int64)
+    integrate(cells, box, cells.dtype != np.uint8, S)
+    return S
+
+
+@kernel
+def _box_sums(S, boxes, out):  # type: ignore[no-untyped-def]
+    mask = np.uint32(0xFFFF) if S.itemsize == 2 else np.uint32(0xFFFFFFFF)
+    for i in range(boxes.shape[0]):
+        b = boxes[i]
+        out[i] = np.uint32(box_sum(S, b[0], b[1], b[2], b[3], b[4], b[5])) & mask
+
+
+def box_sums(S: Integral, boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
+    """Return the sums (B,) over ``boxes`` (B, 6): x0 x1 y0 y1 z0 z1, half-open, cut off at the edges of the grid."""
+    out = np.empty(len(boxes), dtype=np.uint32)
+    _box_sums(S, np.ascontiguousarray(boxes, dtype=np.int64), out)
+    return out

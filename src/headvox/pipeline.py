@@ -1,0 +1,389 @@
+"""The detector: a frame in, heads out. :meth:`Detector.detect_frame` is the whole flow, one line a stage."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.config import DetectorConfig
+from headvox.data import F64, Cloud, DepthImage, Frame, Heads
+from headvox.errors import HeadvoxError
+from headvox.frames import as_rigid
+from headvox.fuse import Region
+from headvox.gate import column_bound, gate_columns
+from headvox.integral import integrate
+from headvox.kernels import Threads
+from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
+from headvox.refine import MOST_PARTS, fit_spheres, skull_centres
+from headvox.suppress import local_maxima, suppress_overlaps
+from headvox.visibility import camera_table, cells_of, count_states, look_about
+from headvox.vote import DROPPED, feature_count, seen_boxes, stage_tables, vote_masks, vote_stages
+from headvox.voxelize import Lattice, Rays, clear, mark_depth, mark_points, merge, new_box, part_transform
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+
+STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
+SAME_HEAD_M = 0.18
+BEHIND_M = 0.016
+ABOVE_M = 0.006
+
+
+class Detector:
+    """Finds heads in point clouds and depth images.
+
+    A detector keeps its working memory between frames, so it is not for two threads at once: give each its own.
+    ``stage_ms`` holds what each stage of the last frame took.
+
+    >>> import numpy as np
+    >>> detector = Detector()
+    >>> len(detector.detect(np.random.default_rng(0).uniform(-1, 1, (100, 3)).astype(np.float32)))
+    0
+    """
+
+    def __init__(self, config: DetectorConfig | None = None) -> None:
+        self.config = config or DetectorConfig()
+        self.cascade = compile_cascade(load_cascade(self.config.cascade), self.config.voxel_m)
+        self.stage_ms = dict.fromkeys(STAGES, 0.0)
+        self.candidates = 0
+        """How many voxels of the last frame passed the gate."""
+        self._threads = Threads(self.config.threads)
+        self._memory: _Memory | None = None
+        self._rays: dict[str, tuple[DepthImage, Lattice, Rays]] = {}
+
+    # ------------------------------------------------------------------------------------------- the public calls
+
+    def detect(self, points: npt.NDArray[np.float32], T_world_sensor: npt.ArrayLike | None = None) -> Heads:
+        """Return the heads in ``points``, (N, 3) float32 in metres, NaN where invalid.
+
+        The points are in the world frame (z up), or in the frame that ``T_world_sensor`` (4, 4) places there.
+
+        Raises:
+            HeadvoxError: wrong shape or dtype, a transform that is not rigid, or no point within range.
+        """
+        T = None if T_world_sensor is None else as_rigid(T_world_sensor, "T_world_sensor")
+        return self.detect_frame(Frame(0, clouds=(Cloud("points", points, T),)))
+
+    def detect_depth(self, images: DepthImage | Sequence[DepthImage]) -> Heads:
+        """Return the heads in one depth image, or in those of several cameras at one moment.
+
+        Raises:
+            HeadvoxError: an image that does not fit its camera, a transform that is not rigid, or no return in range.
+        """
+        return self.detect_frame(Frame(0, depths=(images,) if isinstance(images, DepthImage) else tuple(images)))
+
+    def detect_frame(self, frame: Frame) -> Heads:
+        """Return the heads in everything that the sensors saw at one moment."""
+        _check_frame(frame)
+        clock = _Clock(self.stage_ms)
+        memory = self._memory_for(frame)
+        box = self._voxelize(frame, memory)
+        clock.done("voxelize")
+        S = self._integrate(memory, box)
+        clock.done("integral")
+        survivors = self._gate(S, memory)
+        clock.done("gate")
+        scores = self._vote(S, survivors, memory)
+        clock.done("vote")
+        peaks = self._suppress(S, survivors, scores, memory)
+        clock.done("suppress")
+        peaks, scores = self._judge(frame, S, survivors, scores, peaks, box, memory)
+        clock.done("judge")
+        heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, box, memory)
+        clock.done("refine")
+        clear(memory.cells[0], box)
+        return heads
+
+    def close(self) -> None:
+        """End the detector's threads."""
+        self._threads.close()
+
+    # -------------------------------------------------------------------------------------------------- the stages
+
+    def _voxelize(self, frame: Frame, memory: _Memory) -> I64:
+        """Enter every reading into the grid; return the box of cells that may pass the gate."""
+        lattice, parts = memory.lattice, self._threads.count
+        limits, shape, shift = lattice.limits(), lattice.shape, lattice.subdivision - 1
+        counting = self.cascade.source.counting
+        boxes = [new_box() for _ in range(parts)]
+
+        def mark(part: int) -> None:
+            cells, box = memory.flat[part], boxes[part]
+            for cloud in frame.clouds:
+                low, high = _share(len(cloud.points), part, parts)
+                T = part_transform(cloud, lattice)
+                mark_points(cloud.points[low:high], T, limits, shape, shift, counting, box, cells)
+            for image in frame.depths:
+                rays = self._rays_of(image, lattice)
+                low, high = _share(len(image.depth), part, parts)
+                mark_depth(
+                    image.depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting, box, cells
+                )
+
+        self._threads.run(mark, [(part,) for part in range(parts)])
+        box = boxes[0]
+        for cells, other in zip(memory.cells[1:], boxes[1:], strict=True):
+            merge(memory.cells[0], cells, other, counting)
+            box[:3] = np.minimum(box[:3], other[:3])
+            box[3:] = np.maximum(box[3:], other[3:])
+        if box[3] < 0:
+            raise _nothing_in_range(frame, lattice.region)
+        box[:3] = np.maximum(box[:3] - memory.reach, 0)
+        box[3:] = np.minimum(box[3:] + memory.reach, np.array(shape) - 1)
+        return box
+
+    def _integrate(self, memory: _Memory, box: I64) -> npt.NDArray[Any]:
+        shape = tuple(int(n) for n in box[3:] - box[:3] + 2)
+        S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
+        integrate(memory.cells[0], box, self.cascade.source.counting, S)
+        return S
+
+    def _gate(self, S: npt.NDArray[Any], memory: _Memory) -> I32:
+        gate, parts, slices = self.cascade.gate, self._threads.count, S.shape[0] - 1
+        found = [0] * parts
+
+        def sweep(part: int) -> None:
+            low, high = _share(slices, part, parts)
+            arguments = (S, low, high, gate.boxes, gate.start, gate.rank, gate.low, gate.high, memory.least)
+            found[part] = gate_columns(*arguments, memory.survivors[part])
+            if found[part] > len(memory.survivors[part]):
+                memory.survivors[part] = np.empty((2 * found[part], 3), np.int32)
+                gate_columns(*arguments, memory.survivors[part])
+
+        self._threads.run(sweep, [(part,) for part in range(parts)])
+        lists = [survivors[:count] for survivors, count in zip(memory.survivors, found, strict=True)]
+        self.candidates = sum(found)
+        return lists[0] if parts == 1 else np.concatenate(lists)
+
+    def _vote(self, S: npt.NDArray[Any], survivors: I32, memory: _Memory) -> I64:
+        memory.make_room(len(survivors))
+        scores, parts = memory.scores[: len(survivors)], self._threads.count
+        votes, stages = self.cascade.votes, self.cascade.stages
+
+        def score(part: int) -> None:
+            low, high = _share(len(survivors), part, parts)
+            if votes is not None:
+                vote_masks(
+                    S, survivors, low, high, votes.boxes, votes.weights, votes.start, votes.masks, votes.pairs,
+                    votes.asymmetry_cost, votes.min_votes, scores, memory.yaws,
+                )  # fmt: skip
+            elif stages is not None:
+                vote_stages(
+                    S, survivors, memory.seen, low, high, stages.occupied_stages, *memory.tables, memory.features[part],
+                    scores,
+                )  # fmt: skip
+
+        self._threads.run(score, [(part,) for part in range(parts)])
+        return scores
+
+    def _suppress(self, S: npt.NDArray[Any], survivors: I32, scores: I64, memory: _Memory) -> I64:
+        shape = tuple(n - 1 for n in S.shape)
+        index = memory.index[: math.prod(shape)].reshape(shape)
+        found = local_maxima(survivors, scores, DROPPED + 1, index, memory.peaks)
+        return memory.peaks[:found]
+
+    def _judge(
+        self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, box: I64, memory: _Memory
+    ) -> tuple[I64, I64]:
+        """Let the peaks through that reach the cascade's threshold, after a look at what the cameras saw empty."""
+        cascade, stages = self.cascade.source, self.cascade.stages
+        sees = stages is not None and len(memory.offsets) > 0 and len(frame.depths) > 0 and not frame.clouds
+        if sees and stages is not None and len(peaks):
+            cells = survivors[peaks]
+            states = np.zeros((len(cells), len(memory.offsets)), np.uint8)
+            in_lattice = cells + box[:3].astype(np.int32)
+            for image in frame.depths:
+                look_about(image.depth, camera_table(image, memory.lattice), in_lattice, memory.offsets, states)
+            seen = np.empty((len(cells), len(memory.offset_start) - 1, 2), np.int32)
+            count_states(states, memory.offset_start, seen)
+            judged = np.empty(len(cells), np.int64)
+            vote_stages(
+                S, cells, seen, 0, len(cells), len(stages.stage_keep), *memory.tables, memory.features[0], judged
+            )
+            scores[peaks] = judged
+        least = self.config.min_score
+        if least is None:
+            least = cascade.min_score if sees or not cascade.sees else cascade.min_score_occupied
+        return peaks[scores[peaks] >= math.ceil(least * SCORE_UNIT)], scores
+
+    def _refine(
+        self, frame: Frame, cells: I32, scores: I64, peaks: I64, box: I64, memory: _Memory
+    ) -> Heads:
+        count = len(cells)
+        if count == 0:
+            return Heads()
+        cells = cells + box[:3].astype(np.int32)
+        centres = memory.lattice.centres(cells)
+        radii = np.full(count, 0.1)
+        if self.config.refine == "sphere":
+            spheres = np.empty((count, 6))
+            lattice = memory.lattice
+            counting = self.cascade.source.counting
+            fit_spheres(
+                memory.cells[0], cells, lattice.voxel_m, lattice.subdivision, counting, memory.points, spheres
+            )
+            centres = skull_centres(centres + spheres[:, :3], _origins(frame), BEHIND_M, ABOVE_M)
+            radii = spheres[:, 3]
+        kept = suppress_overlaps(centres, scores, SAME_HEAD_M)
+        quaternions = np.full((count, 4), np.nan)
+        if self.cascade.votes is not None:
+            half = 0.5 * self.cascade.votes.yaws_rad[memory.yaws[peaks]]
+            quaternions = np.stack([np.zeros(count), np.zeros(count), np.sin(half), np.cos(half)], axis=1)
+        return Heads(centres[kept], quaternions[kept], radii[kept], scores[kept] / SCORE_UNIT)
+
+    # -------------------------------------------------------------------------------------------- working memory
+
+    def _memory_for(self, frame: Frame) -> _Memory:
+        """Return the working memory, made anew only when the region moved."""
+        region = self._region(frame)
+        if self._memory is None or self._memory.lattice.region != region:
+            lattice = Lattice.over(region, self.cascade.voxel_m, self.cascade.source.subdivision)
+            if self._memory is None or self._memory.lattice.shape != lattice.shape:
+                self._memory = _Memory(lattice, self)
+            self._memory.lattice = lattice
+        return self._memory
+
+    def _region(self, frame: Frame) -> Region:
+        config, centre = self.config, self.config.centre
+        if centre is None:
+            origins = _origins(frame)
+            centre = tuple(float(v) for v in origins.mean(axis=0)) if len(origins) else (0.0, 0.0, 0.0)  # type: ignore[assignment]
+        assert centre is not None
+        return Region(centre, config.max_range_m, config.min_height_m, config.max_height_m)
+
+    def _rays_of(self, image: DepthImage, lattice: Lattice) -> Rays:
+        known = self._rays.get(image.name)
+        if known is not None:
+            same, placed, rays = known
+            if (
+                placed is lattice
+                and same.intrinsics == image.intrinsics
+                and np.array_equal(same.T_world_camera, image.T_world_camera)
+            ):
+                return rays
+        rays = Rays.of(image, lattice)
+        self._rays[image.name] = (image, lattice, rays)
+        return rays
+
+
+class _Memory:
+    """The buffers of a detector: nothing as large as a frame is allocated per frame."""
+
+    def __init__(self, lattice: Lattice, detector: Detector) -> None:
+        cascade, threads = detector.cascade, detector.config.threads
+        counting = cascade.source.counting
+        cell_type = np.uint32 if counting else np.uint8
+        sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
+        cells = math.prod(lattice.shape)
+        self.lattice = lattice
+        self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
+        self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
+        self.S = np.empty(math.prod(n + 1 for n in lattice.shape), sum_type)
+        self.index = np.zeros(cells, np.int32)
+        self.least = column_bound(cascade.gate)
+        self.reach = int(np.abs(cascade.gate.boxes).max(initial=1))
+        self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
+        self.points = np.empty((MOST_PARTS, 3))
+        self.seen = np.zeros((1, 1, 2), np.int32)
+        self.offsets, self.offset_start = np.empty((0, 3), np.int32), np.zeros(1, np.int32)
+        self.tables: tuple[Any, ...] = ()
+        self.features = [np.empty(0, np.int64)] * threads
+        if cascade.stages is not None:
+            boxes, seen_start = seen_boxes(cascade.stages)
+            self.offsets, self.offset_start = cells_of(boxes)
+            self.tables = stage_tables(cascade.stages, seen_start)
+            self.features = [np.zeros(feature_count(cascade.stages), np.int64) for _ in range(threads)]
+        self.make_room(4096)
+
+    def make_room(self, candidates: int) -> None:
+        """Have room for as many candidates."""
+        if not hasattr(self, "scores") or len(self.scores) < candidates:
+            self.scores = np.empty(2 * candidates, np.int64)
+            self.yaws = np.zeros(2 * candidates, np.int32)
+            self.peaks = np.empty(2 * candidates, np.int64)
+
+
+class _Clock:
+    def __init__(self, stage_ms: dict[str, float]) -> None:
+        self.stage_ms = stage_ms
+        self.last = time.perf_counter()
+
+    def done(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.stage_ms[stage] = 1e3 * (now - self.last)
+        self.last = now
+
+
+def _share(count: int, part: int, parts: int) -> tuple[int, int]:
+    """Return the half-open range of ``count`` things that the ``part``-th of ``parts`` threads does."""
+    return count * part // parts, count * (part + 1) // parts
+
+
+def _origins(frame: Frame) -> F64:
+    """Return where the sensors of ``frame`` stand, (S, 3), as far as is known."""
+    placed = [cloud.T_world_sensor for cloud in frame.clouds if cloud.T_world_sensor is not None]
+    placed += [image.T_world_camera for image in frame.depths]
+    return np.array([T[:3, 3] for T in placed], dtype=np.float64).reshape(-1, 3)
+
+
+def _check_frame(frame: Frame) -> None:
+    if not frame.clouds and not frame.depths:
+        raise HeadvoxError("The frame has neither points nor depth images.", "Give at least one sensor's reading.")
+    for cloud in frame.clouds:
+        points = cloud.points
+        if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
+            shape = getattr(points, "shape", type(points).__name__)
+            raise HeadvoxError(f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them.")
+        if points.dtype != np.float32 or not points.flags.c_contiguous:
+            raise HeadvoxError(
+                f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype}.",
+                "Use np.ascontiguousarray(points, dtype=np.float32).",
+            )
+        if len(points) == 0:
+            raise HeadvoxError(f"{cloud.name}: the cloud is empty.", "Is the sensor running?")
+    for image in frame.depths:
+        depth, camera = image.depth, image.intrinsics
+        if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
+            got = f"{getattr(depth, 'dtype', type(depth).__name__)} {getattr(depth, 'shape', '')}"
+            raise HeadvoxError(f"{image.name}: expected a (height, width) uint16 depth image, got {got}.", "Convert it.")
+        if depth.size == 0 or depth.shape != (camera.height, camera.width):
+            raise HeadvoxError(
+                f"{image.name}: the image is {depth.shape[1]}x{depth.shape[0]}, its camera "
+                f"{camera.width}x{camera.height}.",
+                "Give the intrinsics of this image size.",
+            )
+        if not (camera.fx > 0 and camera.fy > 0 and camera.depth_scale > 0):
+            raise HeadvoxError(f"{image.name}: fx, fy and depth_scale must be above 0.", "Check the intrinsics.")
+
+
+def _nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
+    """Say why no point was kept: nothing measured at all, another unit, or another place."""
+    where = f"within {region.radius_m:g} m of ({', '.join(f'{v:.2f}' for v in region.centre)})"
+    for cloud in frame.clouds:
+        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
+        finite = distance[np.isfinite(distance)]
+        if len(finite) == 0:
+            return HeadvoxError(f"{cloud.name}: all {len(cloud.points)} points are NaN or infinite.", "Nothing was seen.")
+        middle = float(np.median(finite))
+        if middle > 100.0:
+            return HeadvoxError(
+                f"{cloud.name}: half of the points are more than {middle:.0f} m away: are they in millimetres?",
+                "headvox expects metres: scale them by 0.001.",
+            )
+        return HeadvoxError(
+            f"{cloud.name}: none of {len(cloud.points)} points is {where} and between {region.min_height_m:g} m and "
+            f"{region.max_height_m:g} m high (nearest: {finite.min():.2f} m from the origin of its frame).",
+            "Set centre, max_range_m, min_height_m or max_height_m, or give the sensor's transform.",
+        )
+    if all(not image.depth.any() for image in frame.depths):
+        return HeadvoxError(f"{frame.depths[0].name}: the depth image has no return at all.", "Is the sensor running?")
+    return HeadvoxError(
+        f"{frame.depths[0].name}: no return is {where} and between {region.min_height_m:g} m and "
+        f"{region.max_height_m:g} m high.",
+        "Check T_world_camera and depth_scale, or set max_range_m, min_height_m or max_height_m.",
+    )

@@ -1,0 +1,61 @@
+"""Non-maximum suppression: of many candidates about one head, the best."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.data import F64
+from headvox.kernels import kernel
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+
+
+@kernel
+def local_maxima(cells, scores, least, index, peaks):  # type: ignore[no-untyped-def]
+    """Write the indices of the local maxima to ``peaks``; return how many there are.
+
+    ``index`` is a volume of zeros over all voxels, and is left so.
+    """
+    nx, ny, nz = index.shape
+    for i in range(cells.shape[0]):
+        index[cells[i, 0], cells[i, 1], cells[i, 2]] = i + 1
+    found = 0
+    for i in range(cells.shape[0]):
+        score = scores[i]
+        best = score >= least
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        for a in range(max(x - 1, 0), min(x + 2, nx)):
+            for b in range(max(y - 1, 0), min(y + 2, ny)):
+                for c in range(max(z - 1, 0), min(z + 2, nz)):
+                    j = index[a, b, c] - 1
+                    # Of equal neighbours the first in the order of the volume is the maximum.
+                    if j >= 0 and j != i and (scores[j] > score or (scores[j] == score and j < i)):
+                        best = False
+        if best:
+            peaks[found] = i
+            found += 1
+    for i in range(cells.shape[0]):
+        index[cells[i, 0], cells[i, 1], cells[i, 2]] = 0
+    return found
+
+
+def suppress(cells: I32, scores: I64, least: int, shape: tuple[int, ...]) -> I64:
+    """Return the indices of the candidates that score at least ``least`` and more than their 3x3x3 neighbours.
+
+    ``cells`` (N, 3) are distinct voxels of a volume of ``shape``, in the order of x, y, z. Of equal neighbours the
+    first one wins.
+    """
+    peaks = np.empty(len(cells), np.int64)
+    found = local_maxima(cells, scores, least, np.zeros(shape, np.int32), peaks)
+    return peaks[:found]
+
+
+def suppress_overlaps(centres: F64, scores: npt.NDArray[np.generic], distance_m: float) -> I64:
+    """Return the indices to keep, best score first, so that no two centres (N, 3) are closer than ``distance_m``."""
+    kept: list[int] = []
+    for i in np.argsort(-scores.astype(np.float64), kind="stable"):
+        if all(np.sum((centres[i] - centres[j]) ** 2) >= distance_m**2 for j in kept):
+            kept.append(int(i))
+    return np.array(kept, np.int64)

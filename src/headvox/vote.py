@@ -1,0 +1,184 @@
+"""Stage 2: what the survivors of the gate look like, as votes of masks or as a boosted sum of look-ups.
+
+*Votes* (the paper): each mask is a signed sum of boxes and votes with its sign; mirrored pairs of boxes that differ cost
+points; the best of a few yaws counts.
+
+*Stages* (the default): sorted sums of rings of boxes go through small trees whose leaves are added up, all in
+integers; after each stage a candidate below the stage's threshold is dropped, so most cost a few trees only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.integral import Integral, box_sum
+from headvox.kernels import kernel, rule
+from headvox.masks import SCORE_UNIT, STATISTICS, CompiledStages, CompiledVotes
+
+DROPPED = -(1 << 40)
+FEATURES_PER_GROUP = len(STATISTICS)
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+F64 = npt.NDArray[np.float64]
+
+
+@rule
+def sum_about(S, x, y, z, box):  # type: ignore[no-untyped-def]
+    """Return the exact sum over ``box`` about the voxel x, y, z as a signed number."""
+    value = box_sum(S, x + box[0], x + box[1], y + box[2], y + box[3], z + box[4], z + box[5])
+    mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
+    return np.int64(value) & mask
+
+
+# ------------------------------------------------------------------------------------------------ the paper's
+
+
+@kernel
+def vote_masks(S, cells, first, last, boxes, weights, start, masks, pairs, cost, min_votes, scores, best_yaw):  # type: ignore[no-untyped-def]
+    """Score the candidates ``first`` to ``last`` of ``cells``: see :func:`score_by_votes`."""
+    for i in range(first, last):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        best = -np.inf
+        for yaw in range(pairs.shape[0]):
+            votes = 0
+            score = 0.0
+            for m in range(yaw * masks, (yaw + 1) * masks):
+                total = np.int64(0)
+                for b in range(start[m], start[m + 1]):
+                    total += weights[b] * sum_about(S, x, y, z, boxes[b])
+                if total > 0:
+                    votes += 1
+                    score += 1.0
+                elif total < 0:
+                    score -= 1.0
+            unlike = 0.0
+            for p in range(pairs.shape[1]):
+                one = sum_about(S, x, y, z, pairs[yaw, p, 0])
+                other = sum_about(S, x, y, z, pairs[yaw, p, 1])
+                if one + other > 0:
+                    unlike += abs(one - other) / (one + other)
+            if pairs.shape[1] > 0:
+                score -= cost * (unlike / pairs.shape[1])
+            if votes >= min_votes and score > best:
+                best = score
+                best_yaw[i] = yaw
+        scores[i] = DROPPED if best == -np.inf else np.int64(np.floor(best * SCORE_UNIT))
+
+
+def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, I32]:
+    """Return each candidate's score, in units of 1/1024, and the index of its best yaw (paper, section 5).
+
+    score = sum over masks of sign(weighted sum) - cost * asymmetry, the asymmetry being the mean over the mirrored
+    pairs of \\|a - b\\| / (a + b). Candidates with too few positive votes at every yaw get DROPPED.
+    """
+    scores = np.empty(len(cells), np.int64)
+    best_yaw = np.zeros(len(cells), np.int32)
+    table = (votes.boxes, votes.weights, votes.start, votes.masks, votes.pairs, votes.asymmetry_cost, votes.min_votes)
+    vote_masks(S, cells, 0, len(cells), *table, scores, best_yaw)
+    return scores, best_yaw
+
+
+# ---------------------------------------------------------------------------------------------------- boosted
+
+
+@rule
+def _statistics(sums, count, out):  # type: ignore[no-untyped-def]
+    """Sort the first ``count`` sums; write smallest, 3rd smallest, 3rd largest, largest and total to ``out``."""
+    total = sums[0]
+    for i in range(1, count):
+        value = sums[i]
+        total += value
+        j = i - 1
+        while j >= 0 and sums[j] > value:
+            sums[j + 1] = sums[j]
+            j -= 1
+        sums[j + 1] = value
+    if count > 1:
+        out[0] = sums[0]
+        out[1] = sums[2]
+        out[2] = sums[count - 3]
+        out[3] = sums[count - 1]
+    out[4] = total
+
+
+@rule
+def _descend(tree, features, feature, cut, left, right):  # type: ignore[no-untyped-def]
+    """Return the leaf of ``tree`` that ``features`` lead to."""
+    node = tree
+    while node >= 0:
+        node = left[node] if features[feature[node]] <= cut[node] else right[node]
+    return ~node
+
+
+@kernel
+def vote_stages(  # type: ignore[no-untyped-def]
+    S, cells, seen, first, last, to_stage, boxes, group_start, group_channel, seen_start, feature, cut, left,
+    right, leaf, root, stage_groups, stage_trees, stage_keep, features, scores,
+):  # fmt: skip
+    """Write the sum of the trees of the first ``to_stage`` stages to ``scores``; DROPPED where a stage says so.
+
+    ``features`` (features,) is working memory. ``seen`` (candidates, boxes of other channels, 2) holds how many cells
+    of a box are known-empty and hidden.
+    """
+    sums = np.empty(64, np.int64)
+    for i in range(first, last):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        score = np.int64(0)
+        for s in range(to_stage):
+            for g in range(stage_groups[s], stage_groups[s + 1]):
+                begin, count, channel = group_start[g], group_start[g + 1] - group_start[g], group_channel[g]
+                for k in range(count):
+                    if channel == 0:
+                        sums[k] = sum_about(S, x, y, z, boxes[begin + k])
+                    else:
+                        sums[k] = seen[i, seen_start[g] + k, channel - 1]
+                _statistics(sums, count, features[FEATURES_PER_GROUP * g :])
+            for t in range(stage_trees[s], stage_trees[s + 1]):
+                score += leaf[_descend(root[t], features, feature, cut, left, right)]
+            if score < stage_keep[s]:
+                score = DROPPED
+                break
+        scores[i] = score
+
+
+def seen_boxes(stages: CompiledStages) -> tuple[I32, I32]:
+    """Return the boxes (B, 6) that look at the channels "empty" and "hidden", and where each group's begin (G,)."""
+    start = np.zeros(len(stages.group_channel), np.int32)
+    boxes = []
+    for g, channel in enumerate(stages.group_channel):
+        if channel:
+            start[g] = len(boxes)
+            boxes += list(stages.boxes[stages.group_start[g] : stages.group_start[g + 1]])
+    return np.array(boxes, np.int32).reshape(-1, 6), start
+
+
+def feature_count(stages: CompiledStages) -> int:
+    """Return how many features a candidate has."""
+    return FEATURES_PER_GROUP * len(stages.group_channel)
+
+
+def score_by_stages(
+    S: Integral, cells: I32, stages: CompiledStages, seen: I32 | None = None
+) -> I64:
+    """Return each candidate's score, in units of 1/1024; DROPPED where a stage dropped it.
+
+    Without ``seen`` (candidates, boxes, 2; see :func:`headvox.visibility.count_seen`) the stages that need the
+    channels "empty" and "hidden" are left out.
+    """
+    _, seen_start = seen_boxes(stages)
+    to_stage = stages.occupied_stages if seen is None else len(stages.stage_keep)
+    seen = np.zeros((len(cells), 1, 2), np.int32) if seen is None else seen
+    scores = np.zeros(len(cells), np.int64)
+    features = np.zeros(feature_count(stages), np.int64)
+    vote_stages(S, cells, seen, 0, len(cells), to_stage, *stage_tables(stages, seen_start), features, scores)
+    return scores
+
+
+def stage_tables(stages: CompiledStages, seen_start: I32) -> tuple[npt.NDArray[np.int32] | I64, ...]:
+    """Return the tables of ``stages`` in the order of :func:`vote_stages`."""
+    return (
+        stages.boxes, stages.group_start, stages.group_channel, seen_start, stages.feature, stages.cut, stages.left,
+        stages.right, stages.leaf, stages.root, stages.stage_groups, stages.stage_trees, stages.stage_keep,
+    )  # fmt: skip

@@ -1,0 +1,291 @@
+"""Points or depth images -> an occupancy grid.
+
+A voxel of a *parts* grid is one byte with a bit for each of its 2x2x2 parts (or one bit for the voxel itself, with a
+subdivision of 1): a bit says "some point fell in here". A voxel of a *count* grid is the number of its points. Both
+are integers that do not depend on the order of the points, so any number of threads gives the same grid.
+
+Cells are half-open: a point on the border of two cells belongs to the upper one. Coordinates are float32; a cell is
+``floor((world - origin) / cell edge)``, the sum taken as written in the kernels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.data import F32, U16, Cloud, DepthImage
+from headvox.fuse import Region, placement
+from headvox.kernels import kernel
+
+NOWHERE = np.int32(-1)
+BLOCK = 1024  # points coded at a time: the codes stay in the first-level cache
+
+Cells = npt.NDArray[np.uint8] | npt.NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True)
+class Lattice:
+    """The voxels of a region: ``shape`` cells of ``voxel_m``, the corner of cell 0, 0, 0 at ``origin`` (world, m).
+
+    The origin is a whole number of voxels, so that the cells of two overlapping regions coincide.
+    """
+
+    origin: tuple[float, float, float]
+    voxel_m: float
+    shape: tuple[int, int, int]
+    subdivision: int
+    region: Region
+
+    @classmethod
+    def over(cls, region: Region, voxel_m: float, subdivision: int) -> Lattice:
+        """Return the lattice that covers ``region``."""
+        (cx, cy, _), radius = region.centre, region.radius_m
+        ox, oy, oz = (
+            math.floor(v / voxel_m) * voxel_m for v in (cx - radius, cy - radius, region.min_height_m)
+        )
+        # The same shape wherever the centre lies, and a spare layer at the upper end: in float32 a point just below a
+        # limit may round onto it.
+        nx = ny = math.ceil(2 * radius / voxel_m) + 2
+        nz = math.ceil((region.max_height_m - region.min_height_m) / voxel_m) + 2
+        return cls((ox, oy, oz), voxel_m, (nx, ny, nz), subdivision, region)
+
+    @property
+    def part_m(self) -> float:
+        """Edge of the smallest thing the grid can tell apart."""
+        return self.voxel_m / self.subdivision
+
+    def limits(self) -> F32:
+        """Return the region's limits in parts from the origin, as the kernels read them."""
+        limits = self.region.limits().astype(np.float64)
+        scale = 1.0 / self.part_m
+        return np.array(
+            [
+                *((limits[k] - self.origin[k]) * scale for k in range(3)),
+                limits[3] * scale * scale,
+                (limits[4] - self.origin[2]) * scale,
+                (limits[5] - self.origin[2]) * scale,
+            ],
+            dtype=np.float32,
+        )
+
+    def centres(self, cells: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+        """Return the world centres (N, 3) of ``cells`` (N, 3)."""
+        return (np.asarray(cells, dtype=np.float64) + 0.5) * self.voxel_m + np.array(self.origin)
+
+
+def new_box() -> npt.NDArray[np.int64]:
+    """Return an empty bounding box: lowest and highest cell in x, y, z."""
+    return np.array([2**30, 2**30, 2**30, -1, -1, -1], dtype=np.int64)
+
+
+@kernel
+def _code_points(xyz, T, limits, shape, shift, box, codes):  # type: ignore[no-untyped-def]
+    """Write cell * 8 + part of each point to ``codes``, or NOWHERE; widen ``box`` by the cells.
+
+    ``xyz`` is flat: with a row length that the compiler knows, it loads whole vectors.
+    """
+    ny = np.int32(shape[1])
+    nz = np.int32(shape[2])
+    m = np.int32(shift)
+    cx, cy, cz, r2, low, high = limits[0], limits[1], limits[2], limits[3], limits[4], limits[5]
+    x0, y0, z0 = np.int32(box[0]), np.int32(box[1]), np.int32(box[2])
+    x1, y1, z1 = np.int32(box[3]), np.int32(box[4]), np.int32(box[5])
+    tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
+    xx, xy, xz = T[0, 0], T[0, 1], T[0, 2]
+    yx, yy, yz = T[1, 0], T[1, 1], T[1, 2]
+    zx, zy, zz = T[2, 0], T[2, 1], T[2, 2]
+    big = np.int32(2**30)
+    for i in range(xyz.shape[0] // 3):
+        px, py, pz = xyz[3 * i], xyz[3 * i + 1], xyz[3 * i + 2]
+        x = tx + (xx * px + xy * py + xz * pz)
+        y = ty + (yx * px + yy * py + yz * pz)
+        z = tz + (zx * px + zy * py + zz * pz)
+        dx = x - cx
+        dy = y - cy
+        dz = z - cz
+        keep = (dx * dx + dy * dy + dz * dz < r2) & (z >= low) & (z < high)
+        ix = np.int32(x)
+        iy = np.int32(y)
+        iz = np.int32(z)
+        vx = ix >> m
+        vy = iy >> m
+        vz = iz >> m
+        part = ((ix & m) << 2) | ((iy & m) << 1) | (iz & m)
+        codes[i] = (((vx * ny + vy) * nz + vz) << 3 | part) if keep else NOWHERE
+        x0 = min(x0, vx if keep else big)
+        y0 = min(y0, vy if keep else big)
+        z0 = min(z0, vz if keep else big)
+        x1 = max(x1, vx if keep else NOWHERE)
+        y1 = max(y1, vy if keep else NOWHERE)
+        z1 = max(z1, vz if keep else NOWHERE)
+    box[0], box[1], box[2], box[3], box[4], box[5] = x0, y0, z0, x1, y1, z1
+
+
+@kernel
+def _code_depth_row(line, column, row_x, row_y, row_z, t, limits, shape, shift, box, codes):  # type: ignore[no-untyped-def]
+    """As :func:`_code_points`, for one row of a depth image: a pixel's point is ``t + depth * (column + row)``."""
+    ny = np.int32(shape[1])
+    nz = np.int32(shape[2])
+    m = np.int32(shift)
+    cx, cy, cz, r2, low, high = limits[0], limits[1], limits[2], limits[3], limits[4], limits[5]
+    x0, y0, z0 = np.int32(box[0]), np.int32(box[1]), np.int32(box[2])
+    x1, y1, z1 = np.int32(box[3]), np.int32(box[4]), np.int32(box[5])
+    tx, ty, tz = t[0], t[1], t[2]
+    column_x, column_y, column_z = column[0], column[1], column[2]
+    big = np.int32(2**30)
+    for u in range(line.shape[0]):
+        depth = np.float32(line[u])
+        x = tx + depth * (column_x[u] + row_x)
+        y = ty + depth * (column_y[u] + row_y)
+        z = tz + depth * (column_z[u] + row_z)
+        dx = x - cx
+        dy = y - cy
+        dz = z - cz
+        keep = (line[u] > 0) & (dx * dx + dy * dy + dz * dz < r2) & (z >= low) & (z < high)
+        ix = np.int32(x)
+        iy = np.int32(y)
+        iz = np.int32(z)
+        vx = ix >> m
+        vy = iy >> m
+        vz = iz >> m
+        part = ((ix & m) << 2) | ((iy & m) << 1) | (iz & m)
+        codes[u] = (((vx * ny + vy) * nz + vz) << 3 | part) if keep else NOWHERE
+        x0 = min(x0, vx if keep else big)
+        y0 = min(y0, vy if keep else big)
+        z0 = min(z0, vz if keep else big)
+        x1 = max(x1, vx if keep else NOWHERE)
+        y1 = max(y1, vy if keep else NOWHERE)
+        z1 = max(z1, vz if keep else NOWHERE)
+    box[0], box[1], box[2], box[3], box[4], box[5] = x0, y0, z0, x1, y1, z1
+
+
+@kernel
+def _mark(codes, counting, cells):  # type: ignore[no-untyped-def]
+    """Enter coded points into the flat grid."""
+    if counting:
+        for code in codes:
+            if code >= 0:
+                cells[code >> 3] += 1
+    else:
+        for code in codes:
+            if code >= 0:
+                cells[code >> 3] |= 1 << (code & 7)
+
+
+@kernel
+def mark_points(points, T, limits, shape, shift, counting, box, cells):  # type: ignore[no-untyped-def]
+    """Enter ``points`` (N, 3) into ``cells`` and widen ``box``."""
+    codes = np.empty(BLOCK, np.int32)
+    xyz = points.reshape(-1)
+    for start in range(0, points.shape[0], BLOCK):
+        count = min(BLOCK, points.shape[0] - start)
+        _code_points(xyz[3 * start : 3 * (start + count)], T, limits, shape, shift, box, codes)
+        _mark(codes[:count], counting, cells)
+
+
+@kernel
+def mark_depth(depth, first, last, column, row, t, limits, shape, shift, counting, box, cells):  # type: ignore[no-untyped-def]
+    """Enter rows ``first`` to ``last`` (exclusive) of a depth image into ``cells`` and widen ``box``."""
+    codes = np.empty(depth.shape[1], np.int32)
+    for v in range(first, last):
+        _code_depth_row(
+            depth[v], column, row[0, v], row[1, v], row[2, v], t, limits, shape, shift, box, codes
+        )
+        _mark(codes, counting, cells)
+
+
+@kernel
+def merge(cells, other, box, counting):  # type: ignore[no-untyped-def]
+    """Add the cells that another thread marked, all within ``box``, and clear them there."""
+    for x in range(box[0], box[3] + 1):
+        for y in range(box[1], box[4] + 1):
+            mine = cells[x, y, box[2] : box[5] + 1]
+            theirs = other[x, y, box[2] : box[5] + 1]
+            for z in range(mine.shape[0]):
+                mine[z] = mine[z] + theirs[z] if counting else mine[z] | theirs[z]
+                theirs[z] = 0
+
+
+@kernel
+def clear(cells, box):  # type: ignore[no-untyped-def]
+    """Empty the cells within ``box``."""
+    for x in range(box[0], box[3] + 1):
+        for y in range(box[1], box[4] + 1):
+            cells[x, y, box[2] : box[5] + 1] = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """A depth camera as the kernels read it: a pixel's point, in parts from the lattice's origin, is
+    ``t + depth * (column[:, u] + row[:, v])`` with the raw depth value.
+    """
+
+    column: F32
+    row: F32
+    t: F32
+
+    @classmethod
+    def of(cls, image: DepthImage, lattice: Lattice) -> Rays:
+        """Return the rays of ``image``'s camera in ``lattice``."""
+        camera, T = image.intrinsics, image.T_world_camera
+        scale = camera.depth_scale / lattice.part_m
+        across = (np.arange(camera.width) - camera.cx) / camera.fx
+        down = (np.arange(camera.height) - camera.cy) / camera.fy
+        column = (T[:3, 0, None] * across + T[:3, 2, None]) * scale
+        row = T[:3, 1, None] * down * scale
+        t = (T[:3, 3] - np.array(lattice.origin)) / lattice.part_m
+        return cls(
+            np.ascontiguousarray(column, dtype=np.float32),
+            np.ascontiguousarray(row, dtype=np.float32),
+            t.astype(np.float32),
+        )
+
+
+def part_transform(cloud: Cloud, lattice: Lattice) -> F32:
+    """Return (4, 4) float32 from ``cloud``'s frame to parts from the lattice's origin."""
+    T = placement(cloud.T_world_sensor).astype(np.float64)
+    T[:3, 3] -= np.array(lattice.origin)
+    T[:3] /= lattice.part_m
+    return T.astype(np.float32)
+
+
+def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cells:
+    """Return the grid of one cloud: uint8 parts, or uint32 points a voxel with ``count``; shape as the lattice."""
+    cells = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
+    mark_points(
+        cloud.points,
+        part_transform(cloud, lattice),
+        lattice.limits(),
+        lattice.shape,
+        lattice.subdivision - 1,
+        count,
+        new_box(),
+        cells,
+    )
+    return cells.reshape(lattice.shape)
+
+
+def voxelize_depth(image: DepthImage, lattice: Lattice, count: bool = False) -> Cells:
+    """Return the grid of one depth image, without making a cloud; else as :func:`voxelize_points`."""
+    cells = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
+    rays = Rays.of(image, lattice)
+    depth: U16 = image.depth
+    mark_depth(
+        depth,
+        0,
+        depth.shape[0],
+        rays.column,
+        rays.row,
+        rays.t,
+        lattice.limits(),
+        lattice.shape,
+        lattice.subdivision - 1,
+        count,
+        new_box(),
+        cells,
+    )
+    return cells.reshape(lattice.shape)

@@ -1,0 +1,1 @@
+"""Synthetic people, heads, scenes and depth cameras with exact ground truth."""

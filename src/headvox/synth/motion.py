@@ -1,0 +1,215 @@
+"""What people do from moment to moment: walk about, stand, turn, sit down and stand up, look around.
+
+Everything is drawn once, as a list of moments 1/30 s apart; a scene only looks moments up, so that frames can
+be made in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import ndimage
+
+from headvox.data import F64
+from headvox.synth.poses import Pose
+from headvox.synth.room import CELL_M, FloorPlan, Room
+
+if TYPE_CHECKING:
+    from headvox.synth.scene import People
+
+Rng = np.random.Generator
+
+RATE_HZ = 30.0
+STRIDE_M = 1.35  # two steps
+PERSONAL_M = 0.75
+TURN_RAD_S = 1.8
+SPEED_UP_M_S2 = 1.2
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """How and where somebody is: hips above ``xy``, facing ``heading_rad``, lowest point at ``floor_z``."""
+
+    pose: Pose
+    xy: tuple[float, float]
+    heading_rad: float
+    floor_z: float = 0.0
+
+
+def between(first: Pose, second: Pose, share: float) -> Pose:
+    """A pose on the way from one to another, ``share`` 0..1; it takes the name of the nearer one."""
+    names = ("pelvis", "chest", "head", "arms", "legs", "feet", "hands", "whole")
+    mixed = {name: _mix(getattr(first, name), getattr(second, name), share) for name in names}
+    return replace(first if share < 0.5 else second, **mixed)
+
+
+def _mix(first: Any, second: Any, share: float) -> Any:
+    if isinstance(first, tuple):
+        return tuple(_mix(a, b, share) for a, b in zip(first, second, strict=True))
+    return float((1.0 - share) * first + share * second)
+
+
+def wander(rng: Rng, steps: int, spread: float, period_s: float) -> F64:
+    """A smooth random signal (steps,) of standard deviation ``spread`` that changes within ``period_s``."""
+    sigma = period_s * RATE_HZ / 4.0
+    white = rng.standard_normal(steps + int(8 * sigma))
+    smooth = ndimage.gaussian_filter1d(white, sigma, mode="wrap") * np.sqrt(2.0 * sigma * np.sqrt(np.pi))
+    return np.asarray(spread * smooth[:steps])
+
+
+def looking(rng: Rng, poses: Sequence[Pose]) -> list[Pose]:
+    """The same poses with a head that looks around."""
+    roll, pitch = wander(rng, len(poses), 0.06, 2.0), wander(rng, len(poses), 0.12, 2.0)
+    yaw = np.clip(wander(rng, len(poses), 0.45, 2.5), -1.2, 1.2)
+    return [
+        replace(
+            p, head=(p.head[0] + float(r), p.head[1] + float(q), float(np.clip(p.head[2] + y, -1.3, 1.3)))
+        )
+        for p, r, q, y in zip(poses, roll, pitch, yaw, strict=True)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Stroll:
+    """Where a walker is at every step: ``xy`` (T, 2) metres, ``heading_rad`` (T,), ``speed`` (T,) m/s."""
+
+    xy: F64
+    heading_rad: F64
+    speed: F64
+
+
+def stroll(
+    rng: Rng, plan: FloorPlan, starts: F64, headings: F64, bystanders: F64, steps: int
+) -> list[Stroll]:
+    """Let people walk between random places of the free floor; they wait for, and go round, each other.
+
+    ``starts`` (N, 2), ``headings`` (N,), ``bystanders`` (M, 2) people who stay where they are.
+    """
+    free = _roomy(plan)
+    xy, heading, speed = starts.copy(), headings.copy(), np.zeros(len(starts))
+    pace = rng.uniform(0.6, 1.3, len(starts))
+    goals = np.array([_goal(rng, plan, free, start) for start in starts]).reshape(-1, 2)
+    paths = [Stroll(np.empty((steps, 2)), np.empty(steps), np.empty(steps)) for _ in starts]
+    for step in range(steps):
+        for k in range(len(xy)):
+            others = np.concatenate([np.delete(xy, k, axis=0), bystanders])
+            if np.hypot(*(goals[k] - xy[k])) < 0.25:
+                goals[k] = _goal(rng, plan, free, xy[k])
+            way = goals[k] - xy[k]
+            off = (float(np.arctan2(way[1], way[0])) - heading[k] + np.pi) % (2.0 * np.pi) - np.pi
+            heading[k] += float(np.clip(off, -TURN_RAD_S / RATE_HZ, TURN_RAD_S / RATE_HZ))
+            ahead = np.array([np.cos(heading[k]), np.sin(heading[k])])
+            wanted = pace[k] * max(0.0, float(np.cos(off))) ** 2 * min(1.0, float(np.hypot(*way)) / 0.4)
+            if _blocked(xy[k], ahead, others) or not _is_free(plan, free, xy[k] + 0.1 * ahead):
+                wanted, speed[k] = 0.0, min(speed[k], 0.3)
+                if rng.uniform() < 0.05:
+                    goals[k] = _goal(rng, plan, free, xy[k])
+            speed[k] += float(
+                np.clip(wanted - speed[k], -3.0 * SPEED_UP_M_S2 / RATE_HZ, SPEED_UP_M_S2 / RATE_HZ)
+            )
+            here = xy[k] + ahead * speed[k] / RATE_HZ
+            if speed[k] > 0.0 and _is_free(plan, free, here) and not _blocked(xy[k], ahead, others):
+                xy[k] = here
+            else:
+                speed[k] = 0.0
+            paths[k].xy[step], paths[k].heading_rad[step], paths[k].speed[step] = xy[k], heading[k], speed[k]
+    return paths
+
+
+def _roomy(plan: FloorPlan) -> Any:
+    """Cells with 35 cm of free floor around them."""
+    reach = int(0.35 / CELL_M)
+    return ~ndimage.binary_dilation(np.pad(plan.taken, 1, constant_values=True), iterations=reach)[1:-1, 1:-1]
+
+
+def _is_free(plan: FloorPlan, free: Any, xy: F64) -> bool:
+    cell = np.floor((xy - plan.origin) / CELL_M).astype(int)
+    return bool((cell >= 0).all() and (cell < free.shape).all() and free[cell[0], cell[1]])
+
+
+def _goal(rng: Rng, plan: FloorPlan, free: Any, start: F64) -> F64:
+    """A free place that can be reached in a straight line; the start itself if there is none."""
+    cells = np.argwhere(free)
+    best = start
+    for _ in range(25 if len(cells) else 0):
+        goal = plan.origin + (cells[int(rng.integers(len(cells)))] + 0.5) * CELL_M
+        line = start + np.linspace(0.0, 1.0, 40)[:, None] * (goal - start)
+        line = line[np.hypot(*(line - start).T) > 0.3]
+        if all(_is_free(plan, free, p) for p in line) and np.hypot(*(goal - start)) > np.hypot(
+            *(best - start)
+        ):
+            best = goal
+            if np.hypot(*(best - start)) > 1.5:
+                break
+    return best
+
+
+def _blocked(xy: F64, ahead: F64, others: F64) -> bool:
+    way = others - xy
+    distance = np.hypot(way[:, 0], way[:, 1])
+    return bool(((distance < PERSONAL_M) & (way @ ahead > 0.2 * distance)).any())
+
+
+def walking(rng: Rng, people: People, base: Pose, path: Stroll) -> list[Moment]:
+    """The moments of somebody who walks along a path and stands, in pose ``base``, where it pauses."""
+    phase = float(rng.uniform(0.0, 2.0 * np.pi)) + 2.0 * np.pi * np.cumsum(path.speed) / RATE_HZ / STRIDE_M
+    effort = np.clip(ndimage.gaussian_filter1d(path.speed, 4.0) / 0.7, 0.0, 1.0)
+    poses = [
+        between(base, people.walking_pose(float(p)), float(e)) for p, e in zip(phase, effort, strict=True)
+    ]
+    poses = [
+        replace(p, posture="walking" if e > 0.3 else "standing") for p, e in zip(poses, effort, strict=True)
+    ]
+    return [
+        Moment(pose, (float(x), float(y)), float(heading))
+        for pose, (x, y), heading in zip(looking(rng, poses), path.xy, path.heading_rad, strict=True)
+    ]
+
+
+def staying(rng: Rng, moment: Moment, steps: int) -> list[Moment]:
+    """The moments of somebody who stays and looks around."""
+    return [replace(moment, pose=pose) for pose in looking(rng, [moment.pose] * steps)]
+
+
+def turning(moment: Moment, steps: int, rad_per_s: float) -> list[Moment]:
+    """The moments of somebody who turns on the spot."""
+    turn = rad_per_s / RATE_HZ
+    return [replace(moment, heading_rad=moment.heading_rad + turn * step) for step in range(steps)]
+
+
+def rising(rng: Rng, sitting: Moment, standing: Pose, steps: int) -> list[Moment]:
+    """The moments of somebody who sits, stands up in front of the seat, and sits down again."""
+    up, down = 0.3 * steps + rng.uniform(-0.1, 0.1) * steps, 0.75 * steps
+    ramp = RATE_HZ * 1.6
+    time = np.arange(steps)
+    share = np.clip((time - up) / ramp, 0.0, 1.0) * np.clip(1.0 - (time - down) / ramp, 0.0, 1.0)
+    share = share * share * (3.0 - 2.0 * share)
+    poses = looking(rng, [between(sitting.pose, standing, float(s)) for s in share])
+    forward = 0.32 * np.array([np.cos(sitting.heading_rad), np.sin(sitting.heading_rad)])
+    return [
+        replace(sitting, pose=pose, xy=(sitting.xy[0] + s * forward[0], sitting.xy[1] + s * forward[1]))
+        for pose, s in zip(poses, share, strict=True)
+    ]
+
+
+def live(rng: Rng, people: People, room: Room, posed: Sequence[Moment], steps: int) -> list[list[Moment]]:
+    """Bring placed people to life: walkers walk, some seated ones stand up, all look around."""
+    walkers = [k for k, moment in enumerate(posed) if moment.pose.posture == "walking"]
+    place = np.array([moment.xy for moment in posed]).reshape(-1, 2)
+    heading = np.array([moment.heading_rad for moment in posed])
+    paths = stroll(rng, room.plan, place[walkers], heading[walkers], np.delete(place, walkers, axis=0), steps)
+    lives = []
+    for k, moment in enumerate(posed):
+        if k in walkers:
+            base = people.sample_pose(rng, "standing")
+            lives.append(walking(rng, people, base, paths[walkers.index(k)]))
+        elif moment.pose.posture == "sitting" and rng.uniform() < 0.4:
+            lives.append(rising(rng, moment, people.sample_pose(rng, "standing"), steps))
+        elif moment.pose.posture == "standing" and rng.uniform() < 0.3:
+            lives.append(turning(moment, steps, float(rng.uniform(-0.8, 0.8))))
+        else:
+            lives.append(staying(rng, moment, steps))
+    return lives

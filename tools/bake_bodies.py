@@ -73,7 +73,7 @@ def kept_joint(label: str) -> bool:
 
 
 def joint_tree(labels: list[str], parents: list[int]) -> tuple[list[int], list[int], list[int]]:
-    """Return the kept joints, their parents among the kept, and for every joint of anny the kept one it goes to."""
+    """Return the kept joints, their parents among the kept, and the kept one each joint of anny goes to."""
     kept = [i for i, label in enumerate(labels) if kept_joint(label)]
     rank = {joint: i for i, joint in enumerate(kept)}
 
@@ -107,7 +107,7 @@ def grid_shapes(model, used: np.ndarray, joints: list[int]) -> np.ndarray:
 
 
 def head_directions(model, used: np.ndarray, joints: list[int]) -> np.ndarray:
-    """Displacement of rest points for one unit of each of HEAD_CHANGES, left and right together: (H, V + J, 3)."""
+    """Displacement of rest points for a unit of each of HEAD_CHANGES, both sides together: (H, V + J, 3)."""
     first = model.blendshapes.shape[0] - 2 * len(model.local_change_labels)
 
     def direction(label: str) -> np.ndarray:

@@ -101,7 +101,7 @@ def load_basis() -> BodyBasis:
 
 
 def _head_landmarks(vertices: F64, joints: F64, names: list[str], is_face: Mask) -> tuple[int, int, Mask]:
-    """Find menton and nasion on the mid-line of the mean body, and the vertices of the skull above the eyes."""
+    """Find menton and nasion on the mid-line of the mean body, and the skull's vertices above the eyes."""
     eye = (joints[names.index("eye.L")] + joints[names.index("eye.R")]) / 2
     front = is_face & (np.abs(vertices[:, 1]) < 1.5e-3) & (vertices[:, 0] > eye[0] - 0.06)
     low = front & (vertices[:, 2] < eye[2] - 0.06)
@@ -132,7 +132,7 @@ def blend_points(
 
 
 def measure_head(vertices: F64) -> tuple[F64, F64]:
-    """Return centre (3,) and size (3,) of the bald head's box: nasion to back of skull, ear to ear, chin to crown."""
+    """Return centre and size (3,) of the bald head's box: nasion to back, ear to ear, chin to crown."""
     basis = load_basis()
     skull = vertices[basis.is_skull]
     low = np.array([skull[:, 0].min(), skull[:, 1].min(), vertices[basis.menton, 2]])

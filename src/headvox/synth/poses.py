@@ -139,7 +139,7 @@ def _trunk_turns(pose: Pose) -> dict[str, F64]:
 
 
 def _swung(rotation: F64, rest_direction: F64, direction: F64, share: float = 1.0) -> F64:
-    """Return ``rotation`` followed by the shortest turn that makes ``rest_direction`` point along ``direction``."""
+    """Return ``rotation``, then the shortest turn that makes ``rest_direction`` point along ``direction``."""
     return _rotation(share * _swing(rotation @ rest_direction, direction)) @ rotation
 
 

@@ -20,7 +20,8 @@ def triangulate(polygons: Iterable[npt.NDArray[np.integer]]) -> I64:
     """Split polygons into fans around their first corner.
 
     Args:
-        polygons: arrays (K, n) of vertex indices, one array for each number of corners n; n < 3 gives nothing.
+        polygons: arrays (K, n) of vertex indices, one array for each number of corners n; n < 3 gives
+            nothing.
 
     Returns:
         (F, 3) int64 vertex indices. A concave polygon is covered, and a little beside it.
@@ -43,9 +44,10 @@ def sample_surface(
 ) -> F32:
     """Return the vertices and points that lie evenly on the triangles.
 
-    A triangle is cut into columns that stand on its longest edge, at most ``spacing_m`` wide, and a column into
-    points at most ``spacing_m`` apart. So a needle costs its length and not its length squared, every triangle has a
-    point inside it, and no part of it is farther than about ``spacing_m`` from a point. There are no random numbers.
+    A triangle is cut into columns that stand on its longest edge, at most ``spacing_m`` apart, and a column has
+    points at most ``spacing_m`` apart. So a needle costs its length and not its length squared, no place on a
+    triangle is farther than about ``spacing_m`` from a point, and triangles so small that their corners do that
+    already get none. There are no random numbers.
 
     Args:
         vertices: (V, 3), metres.
@@ -63,8 +65,8 @@ def sample_surface(
     triangles = np.asarray(faces, dtype=np.int64).reshape(-1, 3)
     _check_spacing(spacing_m, name)
     _check_indices(triangles, len(corners), name)
-    finite = np.isfinite(corners).all(axis=1)
-    shapes = corners[triangles[finite[triangles].all(axis=1)]].astype(np.float64)
+    shapes = corners[triangles].astype(np.float64)
+    shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
     _refuse_too_many(_upper_bounds(shapes, spacing_m).sum(), spacing_m, name)
 
     shapes = _cut_long(shapes, _LONGEST_EDGE * spacing_m)
@@ -91,7 +93,7 @@ def _check_indices(triangles: I64, vertex_count: int, name: str) -> None:
     low, high = int(triangles.min()), int(triangles.max())
     if low < 0 or high >= vertex_count:
         raise HeadvoxError(
-            f"{name}: a face names vertex {low if low < 0 else high}, but the vertices are 0 to {vertex_count - 1}.",
+            f"{name}: a face names vertex {low if low < 0 else high}, expected 0 to {vertex_count - 1}.",
             "The file is damaged, or its indices count from 1.",
         )
 
@@ -99,7 +101,7 @@ def _check_indices(triangles: I64, vertex_count: int, name: str) -> None:
 def _refuse_too_many(points: float, spacing_m: float, name: str) -> None:
     if points > MAX_POINTS:
         raise HeadvoxError(
-            f"{name}: the surface is so large that it needs {points:.1e} points {spacing_m * 1000:g} mm apart, "
+            f"{name}: the surface needs {points:.1e} points {spacing_m * 1000:g} mm apart, "
             f"expected at most {MAX_POINTS:.0e}.",
             "Is it in millimetres? Scale it to metres.",
         )
@@ -130,10 +132,10 @@ def _upper_bounds(shapes: F64, spacing_m: float) -> F64:
     """At most this many points will be made on each triangle."""
     shapes = _longest_edge_first(shapes) / spacing_m
     base, side = shapes[:, 1] - shapes[:, 0], shapes[:, 2] - shapes[:, 0]
-    columns = np.ceil(np.linalg.norm(base, axis=1))
-    highest = np.linalg.norm(np.cross(base, side), axis=1) / np.maximum(columns, 1.0)
-    # The mean of a column's height is half the highest one, and the middle of a column overrates the peak once.
-    return columns * (0.5 * highest + 1.0) + highest + 1.0
+    length = np.linalg.norm(base, axis=1)
+    highest = np.linalg.norm(np.cross(base, side), axis=1) / np.maximum(length, 1.0)
+    bounds: F64 = np.where(length > 1.0, np.ceil(length) * (0.5 * highest + 1.0), 0.0)
+    return bounds
 
 
 def _chunk_starts(bounds: F64) -> I64:
@@ -146,10 +148,11 @@ def _sample(shapes: F64, spacing_m: float) -> F64:
     shapes = _longest_edge_first(shapes)
     start, base, side = shapes[:, 0], shapes[:, 1] - shapes[:, 0], shapes[:, 2] - shapes[:, 0]
     length = np.linalg.norm(base, axis=1)
-    column_counts = np.ceil(length / spacing_m).astype(np.int64)  # 0 where all corners are the same
+    gaps = np.maximum(np.ceil(length / spacing_m), 1.0).astype(np.int64)
+    column_counts = gaps - 1  # the corners stand at both ends
 
     triangle = np.repeat(np.arange(len(shapes)), column_counts)
-    along = (_count_within(column_counts) + 0.5) / column_counts[triangle]
+    along = (_count_within(column_counts) + 1.0) / gaps[triangle]
     with np.errstate(divide="ignore", invalid="ignore"):
         peak = np.clip(np.einsum("ij,ij->i", side, base) / length**2, 0.0, 1.0)
         rise = np.minimum(along / peak[triangle], (1.0 - along) / (1.0 - peak[triangle]))

@@ -1,0 +1,86 @@
+"""Is a point cloud one that heads can be found in?"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.data import F32, F64
+from headvox.errors import HeadvoxError
+
+FARTHEST_MEDIAN_M = 100.0  # no indoor sensor sees its typical point from farther away
+_SAMPLE = 10_000  # points that are looked at: every frame passes here
+
+
+def as_points(values: npt.NDArray[np.generic], name: str) -> F32:
+    """Return (N, 3) numbers as a point array: float32, C-contiguous, a point that is not finite all NaN.
+
+    Args:
+        values: (N, 3), any real numbers, metres; it is not changed.
+        name: what the cloud is called in an error.
+
+    Raises:
+        HeadvoxError: another shape, or entries that are not real numbers.
+    """
+    if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
+        raise HeadvoxError(
+            f"{name}: expected points as (N, 3) numbers, got shape {values.shape} of {values.dtype}.",
+            "Give x, y, z in metres.",
+        )
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes inf and then NaN
+        points = np.array(values, dtype=np.float32, order="C")
+        finite = np.isfinite(points.sum(axis=1, dtype=np.float64))
+    if not finite.all():
+        points[~finite] = np.nan
+    return points
+
+
+def check_cloud(points: F32, name: str) -> None:
+    """Refuse a cloud that has no points, or whose points are plainly not metres near the origin.
+
+    Args:
+        points: (N, 3) floats, NaN where invalid, in the sensor's or the world frame.
+        name: what the cloud is called in the error.
+
+    Raises:
+        HeadvoxError: wrong shape or dtype, no point, no finite point, or a median distance from the origin
+            above 100 m.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+        raise HeadvoxError(
+            f"{name}: expected points as (N, 3) float32, got shape {points.shape} of {points.dtype}.",
+            "Give x, y, z in metres.",
+        )
+    if len(points) == 0:
+        raise HeadvoxError(f"{name}: the cloud is empty, expected points.", "Check how it was recorded.")
+    seen = _finite_rows(points[:: -(-len(points) // _SAMPLE)])
+    if len(seen) == 0:
+        seen = _finite_rows(points)
+    if len(seen) == 0:
+        raise HeadvoxError(
+            f"{name}: all {len(points)} points are NaN or infinite, expected some finite ones.",
+            "Check how it was recorded.",
+        )
+    _check_scale(seen, name)
+
+
+def _finite_rows(points: F32) -> F64:
+    rows: F64 = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    return rows
+
+
+def _check_scale(points: F64, name: str) -> None:
+    distance = float(np.median(np.linalg.norm(points, axis=1)))
+    if distance <= FARTHEST_MEDIAN_M:
+        return
+    spread = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    if spread > FARTHEST_MEDIAN_M:
+        raise HeadvoxError(
+            f"{name}: points lie {distance:.4g} from the origin and {spread:.4g} apart, expected metres; "
+            "these look like millimetres.",
+            "Divide them by 1000.",
+        )
+    raise HeadvoxError(
+        f"{name}: points lie {distance:.4g} m from the origin, expected less than {FARTHEST_MEDIAN_M:g} m.",
+        "Move the cloud near the origin, or divide by 1000 if it is in millimetres.",
+    )

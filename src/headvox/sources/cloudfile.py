@@ -1,0 +1,129 @@
+"""One point cloud in one file, whatever its format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from headvox.data import F32, F64, Cloud, Frame
+from headvox.errors import HeadvoxError
+from headvox.sources.check import check_cloud
+
+MAX_FILE_BYTES = 4 << 30
+SUFFIXES = (".ply", ".pcd", ".npy", ".npz")
+
+
+@dataclass(frozen=True, slots=True)
+class CloudFile:
+    """What a point-cloud file holds.
+
+    ``format`` is for people, such as "ply, ascii"; ``points`` (N, 3) float32 in metres, C-contiguous, invalid
+    points NaN; ``T_world_sensor`` as in :class:`~headvox.data.Cloud`; ``vertices`` the number of points that
+    the file itself has and ``faces`` that of the polygons that were sampled; ``extra`` the fields beside x,
+    y, z.
+    """
+
+    format: str
+    points: F32
+    T_world_sensor: F64 | None = None
+    vertices: int = 0
+    faces: int = 0
+    extra: tuple[str, ...] = ()
+
+
+class CloudFileSource:
+    """A single file as a source of one frame at ``stamp_ns`` 0."""
+
+    length: int | None = 1
+
+    def __init__(self, path: Path) -> None:
+        """Raise HeadvoxError where the file is missing or no known point-cloud file; it is read later."""
+        self.name = path.name
+        self.path = path
+        _reader(_head(path), path.name)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the one frame, or raise HeadvoxError when the file cannot be used."""
+        yield Frame(0, clouds=(read_cloud(self.path),))
+
+    def close(self) -> None:
+        """Do nothing: the file is open only while it is read."""
+
+
+def read_cloud(path: Path) -> Cloud:
+    """Read one file as a cloud with points in it.
+
+    Raises:
+        HeadvoxError: the file is missing, damaged or of unknown kind, or check_cloud refuses its points.
+    """
+    cloud = read_cloud_file(path)
+    return Cloud(path.name, cloud.points, cloud.T_world_sensor)
+
+
+def read_cloud_file(path: Path) -> CloudFile:
+    """Read one file with all that is known about it; errors as for :func:`read_cloud`."""
+    reader = _reader(_head(path), path.name)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise _unreadable(path.name, error) from None
+    cloud = reader(data, path.name)
+    check_cloud(cloud.points, path.name)
+    return cloud
+
+
+def _head(path: Path) -> bytes:
+    """Return the first bytes of a regular file; a pipe or a device could block for ever."""
+    try:
+        if path.exists() and not path.is_file():
+            raise HeadvoxError(f"{path.name}: expected a file or a folder, this is neither.", "Give a file.")
+        size = path.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise HeadvoxError(
+                f"{path.name}: {size} bytes, expected at most {MAX_FILE_BYTES}.", "Cut it into frames."
+            )
+        with path.open("rb") as file:
+            return file.read(4096)
+    except FileNotFoundError:
+        raise HeadvoxError(f"{path}: there is no such file.", "Check the path.") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise _unreadable(path.name, error) from None
+
+
+def _unreadable(name: str, error: Exception) -> HeadvoxError:
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return HeadvoxError(f"{name}: cannot be read: {reason}.", "Check the path and its permissions.")
+
+
+def _reader(head: bytes, name: str) -> Callable[[bytes, str], CloudFile]:
+    """Choose the reader by how the file begins. The modules are imported only when one is needed."""
+    if head[:3] == b"ply" and head[3:4] in (b"\n", b"\r"):
+        from headvox.sources.ply import read_ply
+
+        return read_ply
+    if head[:6] == b"\x93NUMPY":
+        from headvox.sources.arrays import read_npy
+
+        return read_npy
+    if head[:2] == b"PK":
+        from headvox.sources.arrays import read_npz
+
+        return read_npz
+    if _begins_like_pcd(head):
+        from headvox.sources.pcd import read_pcd
+
+        return read_pcd
+    raise HeadvoxError(
+        f"{name}: expected a ply, pcd, npy or npz file, it begins with {head[:12]!r}."
+        if head
+        else f"{name}: the file is empty, expected a ply, pcd, npy or npz file.",
+        "Convert it to one of these, or give the folder of a recording.",
+    )
+
+
+def _begins_like_pcd(head: bytes) -> bool:
+    for line in head.splitlines():
+        if line.strip() and not line.startswith(b"#"):
+            return line.split()[0] in (b"VERSION", b"FIELDS", b"COLUMNS")
+    return head.startswith(b"# .PCD")

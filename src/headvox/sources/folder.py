@@ -1,0 +1,73 @@
+"""A folder of point-cloud files, a frame each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from headvox.data import BadFrame, Frame
+from headvox.errors import HeadvoxError
+from headvox.sources.cloudfile import SUFFIXES, read_cloud
+
+FRAME_NS = 33_333_333  # files have no stamps: they are taken to be 30 a second
+
+
+class FolderSource:
+    """The point-cloud files of a folder in natural order of their names, as frames 1/30 s apart.
+
+    Files that do not end in ply, pcd, npy or npz, hidden files and folders inside are passed over. A file
+    that cannot be used is a :class:`~headvox.data.BadFrame`, and keeps its place in time.
+    """
+
+    length: int | None
+
+    def __init__(self, folder: Path) -> None:
+        """Raise HeadvoxError where the folder cannot be read or has no point-cloud file."""
+        self.name = folder.name or str(folder)
+        self.paths = _cloud_paths(folder)
+        self.length = len(self.paths)
+        self._open = True
+
+    def __iter__(self) -> Iterator[Frame | BadFrame]:
+        """Yield a frame a file, until closed."""
+        for index, path in enumerate(self.paths):
+            if not self._open:
+                return
+            stamp_ns = index * FRAME_NS
+            try:
+                frame = Frame(stamp_ns, clouds=(read_cloud(path),))
+            except HeadvoxError as error:
+                yield BadFrame(stamp_ns, str(error))
+            else:
+                yield frame
+
+    def close(self) -> None:
+        """End the iteration."""
+        self._open = False
+
+
+def natural_key(name: str) -> tuple[tuple[int, str], ...]:
+    """Return what sorts ``frame2`` before ``frame10``."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return tuple((int(part), part) if part[0] in "0123456789" else (-1, part) for part in parts)
+
+
+def _cloud_paths(folder: Path) -> list[Path]:
+    try:
+        paths = [
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not path.is_dir()
+        ]
+    except OSError as error:
+        raise HeadvoxError(
+            f"{folder}: cannot be read: {error.strerror}.", "Check the path and its permissions."
+        ) from None
+    if not paths:
+        raise HeadvoxError(
+            f"{folder}: the folder holds neither recording.json nor any file that ends in "
+            f"{', '.join(SUFFIXES)}.",
+            "Give the folder of a recording, or a folder of point clouds.",
+        )
+    return sorted(paths, key=lambda path: natural_key(path.name))

@@ -104,11 +104,31 @@ def _head_landmarks(vertices: F64, joints: F64, names: list[str], is_face: Mask)
     """Find menton and nasion on the mid-line of the mean body, and the skull's vertices above the eyes."""
     eye = (joints[names.index("eye.L")] + joints[names.index("eye.R")]) / 2
     front = is_face & (np.abs(vertices[:, 1]) < 1.5e-3) & (vertices[:, 0] > eye[0] - 0.06)
-    low = front & (vertices[:, 2] < eye[2] - 0.06)
-    menton = int(np.argmax(np.where(low, 0.4 * vertices[:, 0] - vertices[:, 2], -np.inf)))
+    chin = front & (vertices[:, 0] > eye[0] - 0.005) & (vertices[:, 2] < eye[2] - 0.06)
+    menton = int(np.argmax(np.where(chin, 0.3 * vertices[:, 0] - vertices[:, 2], -np.inf)))
     between_eyes = front & (np.abs(vertices[:, 2] - eye[2]) < 0.012)
     nasion = int(np.argmin(np.where(between_eyes, vertices[:, 0], np.inf)))
     return menton, nasion, is_face & (vertices[:, 2] > eye[2])
+
+
+def mean_height_m(age_years: float, sex: float) -> float:
+    """Return the mean height of people of an age, ``sex`` from 0 (male) to 1 (female)."""
+    ages = (1, 2, 3, 4, 6, 8, 10, 12, 14, 16, 18, 50, 90)
+    male = (0.76, 0.88, 0.96, 1.03, 1.16, 1.28, 1.39, 1.50, 1.64, 1.73, 1.76, 1.75, 1.69)
+    female = (0.74, 0.86, 0.95, 1.02, 1.15, 1.27, 1.39, 1.52, 1.60, 1.63, 1.63, 1.62, 1.56)
+    return float((1.0 - sex) * np.interp(age_years, ages, male) + sex * np.interp(age_years, ages, female))
+
+
+def mean_head_scale(age_years: float, height_ratio: float) -> float:
+    """Return how much larger real heads of an age are than those of the basis.
+
+    The heads of its children are too small, and its heads grow in proportion to height, where real ones grow
+    half as fast.
+    """
+    of_age = float(
+        np.interp(age_years, (1.0, 3.0, 6.0, 10.0, 16.0, 25.0), (1.20, 1.17, 1.10, 1.05, 1.02, 1.01))
+    )
+    return of_age / float(np.sqrt(height_ratio))
 
 
 def blend_points(
@@ -128,7 +148,9 @@ def blend_points(
     points = [basis.mean + np.einsum("k,kpc->pc", code, basis.components) for code in (short, tall)]
     heights = [np.ptp(p[: len(basis.skin_weights), 2]) for p in points]
     share = (height_m - heights[0]) / (heights[1] - heights[0])
-    return np.asarray((1.0 - share) * points[0] + share * points[1])
+    eyes_apart = np.interp(age_years, (12.0, 20.0), (0.1, 0.35))  # those of the basis are too close by 1-3 mm
+    direction = basis.head_changes[basis.head_change_names.index("eye-trans-out")]
+    return np.asarray((1.0 - share) * points[0] + share * points[1] + eyes_apart * direction)
 
 
 def measure_head(vertices: F64) -> tuple[F64, F64]:

@@ -15,7 +15,14 @@ import numpy.typing as npt
 
 from headvox.data import F64
 from headvox.errors import HeadvoxError
-from headvox.synth.bodies import RestBody, blend_points, load_basis, make_rest_body
+from headvox.synth.bodies import (
+    RestBody,
+    blend_points,
+    load_basis,
+    make_rest_body,
+    mean_head_scale,
+    mean_height_m,
+)
 from headvox.synth.poses import POSTURES as POSTURES
 from headvox.synth.poses import Pose as Pose
 from headvox.synth.poses import pose_skeleton
@@ -68,26 +75,6 @@ class PosedBody:
     hair_albedo: float
 
 
-def mean_height_m(age_years: float, sex: float) -> float:
-    """Return the mean height of people of an age, ``sex`` from 0 (male) to 1 (female)."""
-    ages = (1, 2, 3, 4, 6, 8, 10, 12, 14, 16, 18, 50, 90)
-    male = (0.76, 0.88, 0.96, 1.03, 1.16, 1.28, 1.39, 1.50, 1.64, 1.73, 1.76, 1.75, 1.69)
-    female = (0.74, 0.86, 0.95, 1.02, 1.15, 1.27, 1.39, 1.52, 1.60, 1.63, 1.63, 1.62, 1.56)
-    return float((1.0 - sex) * np.interp(age_years, ages, male) + sex * np.interp(age_years, ages, female))
-
-
-def mean_head_scale(age_years: float, height_ratio: float) -> float:
-    """Return how much larger real heads of an age are than those of the basis.
-
-    The heads of its children are too small, and its heads grow in proportion to height, where real ones grow
-    half as fast.
-    """
-    of_age = float(
-        np.interp(age_years, (1.0, 3.0, 6.0, 10.0, 16.0, 25.0), (1.20, 1.17, 1.10, 1.05, 1.02, 1.01))
-    )
-    return of_age / float(np.sqrt(height_ratio))
-
-
 def sample_person(rng: np.random.Generator, child_share: float = 0.15) -> Person:
     """Draw a person; ``child_share`` of them are 3 to 15 years old."""
     if not 0.0 <= child_share <= 1.0:
@@ -102,7 +89,6 @@ def sample_person(rng: np.random.Generator, child_share: float = 0.15) -> Person
     race = rng.dirichlet((0.6, 0.6, 0.6)).tolist()
     basis = load_basis()
     changes = np.clip(rng.normal(0.0, 0.17, len(basis.head_change_names)), -0.4, 0.4)
-    changes[basis.head_change_names.index("eye-trans-out")] += 0.2  # eyes of the basis are 2 mm too close
     return Person(
         age_years=age,
         sex=sex,

@@ -44,10 +44,10 @@ def sample_surface(
 ) -> F32:
     """Return the vertices and points that lie evenly on the triangles.
 
-    A triangle is cut into columns that stand on its longest edge, at most ``spacing_m`` apart, and a column has
-    points at most ``spacing_m`` apart. So a needle costs its length and not its length squared, no place on a
-    triangle is farther than about ``spacing_m`` from a point, and triangles so small that their corners do that
-    already get none. There are no random numbers.
+    A triangle is cut into columns that stand on its longest edge, at most ``spacing_m`` apart, and a column
+    has points at most ``spacing_m`` apart. So a needle costs its length and not its length squared, no place
+    on a triangle is farther than ``spacing_m`` from a point, and triangles so small that their corners do
+    that already get none. There are no random numbers.
 
     Args:
         vertices: (V, 3), metres.

@@ -19,7 +19,7 @@ from headvox.frames import as_rigid
 FILE = "recording.json"
 FORMAT, VERSION = "headvox-recording", 1
 _MAX_JSON_BYTES = 64 << 20
-_MAX_PIXELS = 50_000_000
+_MAX_PIXELS = 8_000_000  # eight times the largest depth sensor
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 

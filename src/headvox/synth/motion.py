@@ -14,8 +14,9 @@ import numpy as np
 from scipy import ndimage
 
 from headvox.data import F64
+from headvox.errors import HeadvoxError
 from headvox.synth.poses import Pose
-from headvox.synth.room import CELL_M, FloorPlan, Room
+from headvox.synth.room import CELL_M, FloorPlan
 
 if TYPE_CHECKING:
     from headvox.synth.scene import People
@@ -24,9 +25,10 @@ Rng = np.random.Generator
 
 RATE_HZ = 30.0
 STRIDE_M = 1.35  # two steps
-PERSONAL_M = 0.75
+PERSONAL_M = 0.65
 TURN_RAD_S = 1.8
 SPEED_UP_M_S2 = 1.2
+WARM_UP = 60  # steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,27 +93,28 @@ def stroll(
     free = _roomy(plan)
     xy, heading, speed = starts.copy(), headings.copy(), np.zeros(len(starts))
     pace = rng.uniform(0.6, 1.3, len(starts))
-    goals = np.array([_goal(rng, plan, free, start) for start in starts]).reshape(-1, 2)
+    goals = starts.copy()
     paths = [Stroll(np.empty((steps, 2)), np.empty(steps), np.empty(steps)) for _ in starts]
     for step in range(steps):
         for k in range(len(xy)):
             others = np.concatenate([np.delete(xy, k, axis=0), bystanders])
             if np.hypot(*(goals[k] - xy[k])) < 0.25:
-                goals[k] = _goal(rng, plan, free, xy[k])
+                goals[k] = _goal(rng, plan, free, xy[k], others)
             way = goals[k] - xy[k]
             off = (float(np.arctan2(way[1], way[0])) - heading[k] + np.pi) % (2.0 * np.pi) - np.pi
             heading[k] += float(np.clip(off, -TURN_RAD_S / RATE_HZ, TURN_RAD_S / RATE_HZ))
             ahead = np.array([np.cos(heading[k]), np.sin(heading[k])])
             wanted = pace[k] * max(0.0, float(np.cos(off))) ** 2 * min(1.0, float(np.hypot(*way)) / 0.4)
-            if _blocked(xy[k], ahead, others) or not _is_free(plan, free, xy[k] + 0.1 * ahead):
+            tight = not _is_free(plan, free, xy[k])  # who starts close to a thing may leave it
+            if _blocked(xy[k], ahead, others) or not (tight or _is_free(plan, free, xy[k] + 0.1 * ahead)):
                 wanted, speed[k] = 0.0, min(speed[k], 0.3)
                 if rng.uniform() < 0.05:
-                    goals[k] = _goal(rng, plan, free, xy[k])
+                    goals[k] = _goal(rng, plan, free, xy[k], others)
             speed[k] += float(
                 np.clip(wanted - speed[k], -3.0 * SPEED_UP_M_S2 / RATE_HZ, SPEED_UP_M_S2 / RATE_HZ)
             )
             here = xy[k] + ahead * speed[k] / RATE_HZ
-            if speed[k] > 0.0 and _is_free(plan, free, here) and not _blocked(xy[k], ahead, others):
+            if (tight or _is_free(plan, free, here)) and not _blocked(xy[k], ahead, others):
                 xy[k] = here
             else:
                 speed[k] = 0.0
@@ -120,8 +123,8 @@ def stroll(
 
 
 def _roomy(plan: FloorPlan) -> Any:
-    """Cells with 35 cm of free floor around them."""
-    reach = int(0.35 / CELL_M)
+    """Cells with 30 cm around them that no thing takes; people give way to each other."""
+    reach = round(0.3 / CELL_M)
     return ~ndimage.binary_dilation(np.pad(plan.taken, 1, constant_values=True), iterations=reach)[1:-1, 1:-1]
 
 
@@ -130,17 +133,17 @@ def _is_free(plan: FloorPlan, free: Any, xy: F64) -> bool:
     return bool((cell >= 0).all() and (cell < free.shape).all() and free[cell[0], cell[1]])
 
 
-def _goal(rng: Rng, plan: FloorPlan, free: Any, start: F64) -> F64:
-    """A free place that can be reached in a straight line; the start itself if there is none."""
+def _goal(rng: Rng, plan: FloorPlan, free: Any, start: F64, others: F64) -> F64:
+    """A free place that can be reached straight, past the ``others``; the start itself if there is none."""
     cells = np.argwhere(free)
     best = start
     for _ in range(25 if len(cells) else 0):
-        goal = plan.origin + (cells[int(rng.integers(len(cells)))] + 0.5) * CELL_M
+        goal = plan.middle(cells[int(rng.integers(len(cells)))])
         line = start + np.linspace(0.0, 1.0, 40)[:, None] * (goal - start)
         line = line[np.hypot(*(line - start).T) > 0.3]
-        if all(_is_free(plan, free, p) for p in line) and np.hypot(*(goal - start)) > np.hypot(
-            *(best - start)
-        ):
+        apart = np.linalg.norm(line[:, None] - others, axis=2) > PERSONAL_M
+        farther = np.hypot(*(goal - start)) > np.hypot(*(best - start))
+        if farther and apart.all() and all(_is_free(plan, free, p) for p in line):
             best = goal
             if np.hypot(*(best - start)) > 1.5:
                 break
@@ -150,7 +153,11 @@ def _goal(rng: Rng, plan: FloorPlan, free: Any, start: F64) -> F64:
 def _blocked(xy: F64, ahead: F64, others: F64) -> bool:
     way = others - xy
     distance = np.hypot(way[:, 0], way[:, 1])
-    return bool(((distance < PERSONAL_M) & (way @ ahead > 0.2 * distance)).any())
+    toward = way @ ahead
+    return bool(
+        ((distance < PERSONAL_M) & (toward > 0.2 * distance)).any()
+        | ((distance < 0.5) & (toward > 0.0)).any()
+    )
 
 
 def walking(rng: Rng, people: People, base: Pose, path: Stroll) -> list[Moment]:
@@ -188,28 +195,57 @@ def rising(rng: Rng, sitting: Moment, standing: Pose, steps: int) -> list[Moment
     share = np.clip((time - up) / ramp, 0.0, 1.0) * np.clip(1.0 - (time - down) / ramp, 0.0, 1.0)
     share = share * share * (3.0 - 2.0 * share)
     poses = looking(rng, [between(sitting.pose, standing, float(s)) for s in share])
-    forward = 0.32 * np.array([np.cos(sitting.heading_rad), np.sin(sitting.heading_rad)])
+    seat, front = np.array(sitting.xy), np.array(_in_front(sitting))
     return [
-        replace(sitting, pose=pose, xy=(sitting.xy[0] + s * forward[0], sitting.xy[1] + s * forward[1]))
+        replace(sitting, pose=pose, xy=tuple((seat + s * (front - seat)).tolist()))
         for pose, s in zip(poses, share, strict=True)
     ]
 
 
-def live(rng: Rng, people: People, room: Room, posed: Sequence[Moment], steps: int) -> list[list[Moment]]:
-    """Bring placed people to life: walkers walk, some seated ones stand up, all look around."""
-    walkers = [k for k, moment in enumerate(posed) if moment.pose.posture == "walking"]
+def _in_front(sitting: Moment) -> tuple[float, float]:
+    """Where somebody who sits will stand."""
+    ahead = 0.32 * np.array([np.cos(sitting.heading_rad), np.sin(sitting.heading_rad)])
+    return float(sitting.xy[0] + ahead[0]), float(sitting.xy[1] + ahead[1])
+
+
+def live(
+    rng: Rng, people: People, plan: FloorPlan, posed: Sequence[Moment], acts: Sequence[str], steps: int
+) -> list[list[Moment]]:
+    """Bring placed people to life. ``acts`` says who does what: "walk", "turn", "rise" or "stay".
+
+    Walkers keep to the free floor of ``plan`` and out of each other's way; "rise" is for people who sit.
+    """
+    walkers = [k for k, act in enumerate(acts) if act == "walk"]
     place = np.array([moment.xy for moment in posed]).reshape(-1, 2)
     heading = np.array([moment.heading_rad for moment in posed])
-    paths = stroll(rng, room.plan, place[walkers], heading[walkers], np.delete(place, walkers, axis=0), steps)
+    risen = [_in_front(moment) for moment, act in zip(posed, acts, strict=True) if act == "rise"]
+    bystanders = np.concatenate([np.delete(place, walkers, axis=0), np.array(risen).reshape(-1, 2)])
+    # They are on their way when the scene begins.
+    paths = [
+        Stroll(path.xy[WARM_UP:], path.heading_rad[WARM_UP:], path.speed[WARM_UP:])
+        for path in stroll(rng, plan, place[walkers], heading[walkers], bystanders, steps + WARM_UP)
+    ]
     lives = []
-    for k, moment in enumerate(posed):
-        if k in walkers:
-            base = people.sample_pose(rng, "standing")
-            lives.append(walking(rng, people, base, paths[walkers.index(k)]))
-        elif moment.pose.posture == "sitting" and rng.uniform() < 0.4:
+    for k, (moment, act) in enumerate(zip(posed, acts, strict=True)):
+        if act == "walk":
+            lives.append(walking(rng, people, people.sample_pose(rng, "standing"), paths[walkers.index(k)]))
+        elif act == "rise":
             lives.append(rising(rng, moment, people.sample_pose(rng, "standing"), steps))
-        elif moment.pose.posture == "standing" and rng.uniform() < 0.3:
-            lives.append(turning(moment, steps, float(rng.uniform(-0.8, 0.8))))
-        else:
+        elif act == "turn":
+            lives.append(turning(moment, steps, float(rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 0.8))))
+        elif act == "stay":
             lives.append(staying(rng, moment, steps))
+        else:
+            raise HeadvoxError(f"Expected an act walk, turn, rise or stay, got {act!r}.", "Name one of them.")
     return lives
+
+
+def sample_act(rng: Rng, posture: str) -> str:
+    """What somebody who was placed in a posture may do next."""
+    if posture == "walking":
+        return "walk"
+    if posture == "sitting" and rng.uniform() < 0.4:
+        return "rise"
+    if posture == "standing" and rng.uniform() < 0.3:
+        return "turn"
+    return "stay"

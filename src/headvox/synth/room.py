@@ -391,12 +391,16 @@ def pick(rng: Rng, makers: Sequence[Callable[..., Item]]) -> Item:
 
 
 class FloorPlan:
-    """Which 5 cm cells of a room's floor are taken. Points outside the room count as taken."""
+    """Which 5 cm cells of a room's floor are ``taken`` by things, and which by ``people``, who may walk away.
+
+    Points outside the room count as taken.
+    """
 
     def __init__(self, x_m: float, y_m: float) -> None:
         """A room of ``x_m`` by ``y_m`` metres around the origin, empty."""
         self.origin = np.array([-x_m / 2.0, -y_m / 2.0])
         self.taken: npt.NDArray[np.bool_] = np.zeros((int(x_m / CELL_M), int(y_m / CELL_M)), np.bool_)
+        self.people = self.taken.copy()
 
     def _cells(self, xy: F64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
         cells = np.floor((xy - self.origin) / CELL_M).astype(np.int64)
@@ -405,18 +409,24 @@ class FloorPlan:
     def conflict(self, xy: F64) -> float:
         """Share (0..1) of the points (N, 2) that are over taken cells or outside."""
         cells, inside = self._cells(xy)
-        free = ~self.taken[cells[inside, 0], cells[inside, 1]]
+        i, j = cells[inside].T
+        free = ~(self.taken[i, j] | self.people[i, j])
         return 1.0 - float(free.sum()) / max(len(cells), 1)
 
-    def take(self, xy: F64) -> None:
+    def take(self, xy: F64, by_person: bool = False) -> None:
         """Mark the cells under the points (N, 2)."""
         cells, inside = self._cells(xy)
-        self.taken[cells[inside, 0], cells[inside, 1]] = True
+        i, j = cells[inside].T
+        (self.people if by_person else self.taken)[i, j] = True
+
+    def middle(self, cells: npt.NDArray[np.int64]) -> F64:
+        """Floor points (N, 2) in the middle of cells (N, 2)."""
+        return np.asarray(self.origin + (cells + 0.5) * CELL_M)
 
     def copy(self) -> FloorPlan:
         """A plan of its own."""
         other = FloorPlan(1.0, 1.0)
-        other.origin, other.taken = self.origin.copy(), self.taken.copy()
+        other.origin, other.taken, other.people = self.origin.copy(), self.taken.copy(), self.people.copy()
         return other
 
 

@@ -19,13 +19,14 @@ from headvox.data import F32, F64, U16, Cloud, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.frames import inverse, transform
 from headvox.synth.camera import IDEAL, Lidar, Sensor, d435i, kinect, measure, sweep
-from headvox.synth.motion import RATE_HZ, Moment, live
+from headvox.synth.motion import RATE_HZ, Moment, live, sample_act
 from headvox.synth.people import PosedBody
 from headvox.synth.poses import Pose
 from headvox.synth.rays import NEAR_M, Mesh, View, join, look, spin
 from headvox.synth.room import (
     ON_TABLES,
     Dummy,
+    FloorPlan,
     Item,
     Room,
     add_dummy,
@@ -360,10 +361,19 @@ def real_people() -> People:
 
 
 def place_person(
-    rng: Rng, people: People, room: Room, number: int, posture: str, person: Any = None
+    rng: Rng,
+    people: People,
+    room: Room,
+    number: int,
+    posture: str,
+    reach_m: tuple[float, float] | None = None,
 ) -> Actor | None:
-    """Put a person with what they sit or lie on where there is space; None when the room is too full."""
-    person = people.sample_person(rng) if person is None else person
+    """Put a person with what they sit or lie on where there is space; None when the room is too full.
+
+    ``reach_m`` keeps them within so many metres of the room's middle, along x and y.
+    """
+    person = people.sample_person(rng)
+    reach_m = (0.47 * room.x_m, 0.47 * room.y_m) if reach_m is None else reach_m
     pose = people.sample_pose(rng, posture)
     body = people.pose_person(person, pose, (0.0, 0.0), 0.0, 0.0)
     furniture = _furniture(rng, body)
@@ -372,7 +382,7 @@ def place_person(
         lift = 0.98 * float(furniture[0][0].vertices[:8, 2].max())
     ground = body.vertices[:: max(1, len(body.vertices) // 400), :2]
     for _ in range(25):
-        x, y = (float(n) for n in rng.uniform(-0.47, 0.47, 2) * (room.x_m, room.y_m))
+        x, y = (float(n) for n in rng.uniform(-1.0, 1.0, 2) * reach_m)
         yaw = float(rng.uniform(-np.pi, np.pi))
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, s], [-s, c]])
@@ -384,7 +394,7 @@ def place_person(
             continue
         for (thing, _), (px, py) in zip(furniture, spots, strict=True):
             room.add(thing, px, py, yaw)
-        room.plan.take(ground @ turn + (x, y))
+        room.plan.take(ground @ turn + (x, y), by_person=True)
         cloth = float(rng.uniform(0.03, 0.12) if rng.uniform() < 0.12 else rng.uniform(0.15, 0.9))
         return Actor(number, person, [Moment(pose, (x, y), yaw, lift)], cloth)
     return None
@@ -470,9 +480,18 @@ def sample_scene(
             Camera(f"camera_{k}", intrinsics, sample_camera_pose(rng, room, targets, intrinsics), sensor)
         )
     if moving:
-        lives = live(rng, people, room, [actor.moments[0] for actor in actors], int(duration_s * RATE_HZ))
-        actors = [replace(actor, moments=moments) for actor, moments in zip(actors, lives, strict=True)]
+        acts = [sample_act(rng, actor.moments[0].pose.posture) for actor in actors]
+        actors = animated(rng, people, room.plan, actors, acts, duration_s)
     return Scene(int(rng.integers(2**31)), people, room, actors, rig)
+
+
+def animated(
+    rng: Rng, people: People, plan: FloorPlan, actors: list[Actor], acts: Sequence[str], duration_s: float
+) -> list[Actor]:
+    """The same people, doing what ``acts`` says (see :func:`.motion.live`)."""
+    steps = max(1, round(duration_s * RATE_HZ))
+    lives = live(rng, people, plan, [actor.moments[0] for actor in actors], acts, steps)
+    return [replace(actor, moments=moments) for actor, moments in zip(actors, lives, strict=True)]
 
 
 def _head_centre(people: People, actor: Actor) -> F64:

@@ -1,0 +1,405 @@
+"""The command ``headvox``: flags in, calls to the library, exit codes out.
+
+0 good, 1 a known error, 2 wrong usage, 130 Ctrl-C. Heavy imports are inside the commands, so that ``--help``
+is immediate. Results go to standard output and nothing else does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import math
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from headvox import __version__
+from headvox.errors import HeadvoxError
+from headvox.sinks import SUFFIXES
+from headvox.table import printable, table
+
+if TYPE_CHECKING:
+    from headvox.config import DetectorConfig
+
+GOOD, KNOWN_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
+
+# Commands that read their own flags: `headvox NAME ...` is MODULE.main([...]).
+MODULES = {"bench": "headvox.bench"}
+
+DESCRIPTION = (
+    "Find human heads in 3-D, in real time, in point clouds and depth images, without a neural network."
+)
+EXAMPLES = """\
+examples:
+  headvox run                                  the sample recording that ships with headvox
+  headvox run cloud.ply                        the heads in one cloud
+  headvox run recording/ --json                one JSON object a frame
+  headvox run recording/ -o heads.csv          one row a head
+  headvox config --max-range 4 > my.toml       settings to keep, for --config my.toml
+
+exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 130 Ctrl-C
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line ``argv`` (by default the process's own) and return its exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    try:
+        code = _dispatch(arguments)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        _forget_stdout()
+        return GOOD
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        _complain(*_words(error))
+        return KNOWN_ERROR
+    return code
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if arguments and arguments[0] in MODULES:
+        module = importlib.import_module(MODULES[arguments[0]])
+        return int(module.main([argument for argument in arguments[1:] if argument != "--debug"]) or GOOD)
+    parser = _parser()
+    args = parser.parse_args(arguments)
+    try:
+        return int(args.command(args))
+    except _UsageError as error:
+        args.parser.print_usage(sys.stderr)
+        _complain(str(error), f"See {args.parser.prog} --help.")
+        return USAGE
+
+
+class _UsageError(Exception):
+    """The flags do not go together."""
+
+
+def _words(error: Exception) -> tuple[str, str]:
+    """Return what happened and what to do about it."""
+    if isinstance(error, HeadvoxError):
+        return error.what, error.do
+    if isinstance(error, MemoryError):
+        return "Not enough memory.", "Set a smaller --max-range, or a larger --voxel."
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        return f"{name}{error.strerror or error}.", ""
+    return (
+        f"internal error: {type(error).__name__}: {error}",
+        "This is a fault of headvox: please report it, with what the same command prints with --debug.",
+    )
+
+
+def _complain(what: str, do: str) -> None:
+    try:
+        for line in (f"headvox: error: {what}", f"  {do}" if do else ""):
+            if line:
+                print(printable(line), file=sys.stderr)
+    except BrokenPipeError:
+        pass
+
+
+def _forget_stdout() -> None:
+    """Let what is still buffered go nowhere: the pipe is closed, and Python would complain at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+# ---------------------------------------------------------------------------------------------------- commands
+
+
+def _run(args: argparse.Namespace) -> int:
+    config = _config(args)
+    from headvox.sinks import Sink, open_sink
+    from headvox.sources import open_source
+
+    path = args.source or _sample()
+    with ExitStack() as stack:
+        source = stack.enter_context(closing(open_source(path)))
+
+        from headvox.live import Live
+        from headvox.pipeline import Detector
+        from headvox.run import run
+        from headvox.sinks.jsonl import JsonStream
+        from headvox.sinks.summary import summary
+        from headvox.warmup import warm_up
+
+        live = stack.enter_context(closing(Live(sys.stderr, source.length)))
+        if args.source is None:
+            live.note(f"no SOURCE given: running the sample that ships with headvox, {path}")
+        detector = stack.enter_context(closing(Detector(config)))
+        warm_up(config)
+        sinks: list[Sink] = [JsonStream(sys.stdout)] if args.json else []
+        if args.output is not None:
+            _keep_input(args.output, [path, args.config, config.cascade])
+            sinks.append(stack.enter_context(closing(open_sink(args.output))))
+        report = run(
+            source,
+            detector,
+            sinks,
+            strict=args.strict,
+            limit=args.limit,
+            on_bad=lambda index, reason: live.note(f"headvox: frame {index} skipped: {reason}"),
+            on_frame=live.frame,
+        )
+    if not args.json:
+        print(summary(report))
+    return INTERRUPTED if report.interrupted else GOOD
+
+
+def _info(args: argparse.Namespace) -> int:
+    from headvox.sources.describe import describe
+
+    print(table([], [list(row) for row in describe(args.source)]))
+    return GOOD
+
+
+def _show_config(args: argparse.Namespace) -> int:
+    from headvox.config import to_toml
+    from headvox.masks import load_cascade
+
+    config = _config(args)
+    load_cascade(config.cascade)  # a wrong name is to be told now, not when the file is used
+    print(to_toml(config), end="")
+    return GOOD
+
+
+def _warmup(args: argparse.Namespace) -> int:
+    import time
+
+    begun = time.perf_counter()
+    from headvox.config import DetectorConfig
+    from headvox.masks import shipped_cascades
+    from headvox.warmup import cache_folder, warm_up
+
+    rows = []
+    for cascade in shipped_cascades():
+        for threads in (1, 2):
+            started = time.perf_counter()
+            warm_up(DetectorConfig(cascade=cascade, threads=threads))
+            seconds = time.perf_counter() - started
+            rows.append([cascade, str(threads), f"{seconds:.2f}"])
+            print(f"{cascade}, {threads} thread{'s' * (threads > 1)}: {seconds:.2f} s", file=sys.stderr)
+    print(table(["cascade", "threads", "seconds"], rows))
+    print(f"\nAll loops are ready after {time.perf_counter() - begun:.1f} s, kept in {cache_folder()}")
+    return GOOD
+
+
+def _masks_list(args: argparse.Namespace) -> int:
+    from headvox.masks import load_cascade, shipped_cascades
+
+    cascades = [(name, load_cascade(name)) for name in shipped_cascades()]
+    rows = [
+        [name, "votes" if cascade.votes else "stages", f"{1e3 * cascade.voxel_m:g} mm", cascade.summary]
+        for name, cascade in cascades
+    ]
+    print(table(["cascade", "second stage", "voxel", "summary"], rows))
+    return GOOD
+
+
+def _masks_show(args: argparse.Namespace) -> int:
+    from headvox.describe_masks import describe_cascade
+    from headvox.masks import load_cascade
+
+    print(describe_cascade(load_cascade(args.cascade)))
+    return GOOD
+
+
+def _masks_plot(args: argparse.Namespace) -> int:
+    from headvox.masks import load_cascade
+    from headvox.plot_masks import file_name, plot_cascade
+
+    cascade = load_cascade(args.cascade)
+    folder = args.output or Path(f"masks-{file_name(cascade.name)}")
+    for path in plot_cascade(cascade, folder):
+        print(path, flush=True)
+    return GOOD
+
+
+def _sample() -> Path:
+    sample = Path(__file__).parent / "assets" / "sample"
+    if not sample.is_dir():
+        raise HeadvoxError("This headvox has no sample recording in it.", "Give a SOURCE: headvox run PATH.")
+    return sample
+
+
+def _config(args: argparse.Namespace) -> DetectorConfig:
+    """Return the settings: flags beat the file, the file beats the defaults."""
+    from dataclasses import fields, replace
+
+    from headvox.config import DetectorConfig, load_config
+
+    config = DetectorConfig() if args.config is None else load_config(args.config)
+    names = [field.name for field in fields(DetectorConfig)]
+    flags = {name: getattr(args, name) for name in names if getattr(args, name, None) is not None}
+    if "centre" in flags:
+        flags["centre"] = tuple(flags["centre"])
+    try:
+        return replace(config, **flags)
+    except HeadvoxError as error:
+        raise _UsageError(error.what) from None
+
+
+def _keep_input(output: Path, inputs: Sequence[str | Path | None]) -> None:
+    """Refuse to write over what is read."""
+    target = output.resolve()
+    for path in inputs:
+        if path is None or not Path(path).exists():
+            continue
+        source = Path(path).resolve()
+        same = target == source or (target.exists() and target.samefile(source))
+        if same or (source.is_dir() and source in target.parents):
+            raise HeadvoxError(
+                f"Output {output} would be written into the input {path}.", "Choose another place."
+            )
+
+
+# ------------------------------------------------------------------------------------------------------- flags
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "headvox",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"headvox {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    run = _command(commands, "run", _run, "find heads in a recording, a cloud, or a folder of clouds")
+    run.add_argument(
+        "source",
+        nargs="?",
+        type=Path,
+        metavar="SOURCE",
+        help="a depth recording (folder), a ply, pcd, npy or npz file, or a folder of those; "
+        "without it, the sample recording that ships with headvox",
+    )
+    run.add_argument("--json", action="store_true", help="print one JSON object a frame, and nothing else")
+    run.add_argument(
+        "-o",
+        dest="output",
+        type=output_file,
+        metavar="OUT",
+        help=f"also write a file: {' or '.join(SUFFIXES)}",
+    )
+    run.add_argument(
+        "--no-track",
+        action="store_true",
+        help="bare detections; this version has no tracking yet: ids and velocities are null either way",
+    )
+    run.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
+    run.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
+    _add_settings(run)
+
+    info = _command(commands, "info", _info, "tell what a source holds")
+    info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
+
+    config = _command(commands, "config", _show_config, "print the settings as TOML, as --config takes them")
+    _add_settings(config)
+
+    _command(commands, "warmup", _warmup, "compile every loop now, so that no first run has to wait")
+    _add_masks(commands)
+    for name in MODULES:
+        commands.add_parser(name, help=f"see headvox {name} --help")
+    return parser
+
+
+def _add_masks(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    masks = commands.add_parser("masks", help="list, show and plot cascades of masks", allow_abbrev=False)
+    actions = masks.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _command(actions, "list", _masks_list, "list the cascades that ship with headvox")
+    cascade = "name of a shipped cascade, or a cascade file"
+    show = _command(
+        actions, "show", _masks_show, "show the conditions, groups and stages of a cascade as tables"
+    )
+    show.add_argument("cascade", metavar="CASCADE", help=cascade)
+    plot = _command(actions, "plot", _masks_plot, "draw each mask of a cascade to a PNG file")
+    plot.add_argument("cascade", metavar="CASCADE", help=cascade)
+    plot.add_argument(
+        "-o", dest="output", type=Path, metavar="DIR", help="folder for the pictures (masks-NAME)"
+    )
+
+
+def _command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, function: object, text: str
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name, help=text, description=text[0].upper() + text[1:] + ".", allow_abbrev=False
+    )
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    parser.set_defaults(command=function, parser=parser)
+    return parser
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add a flag for each setting; without the flag, the file or the default says."""
+    group = parser.add_argument_group(
+        "settings of the detector", "flags beat --config, --config beats the defaults"
+    )
+    group.add_argument(
+        "--config", type=Path, metavar="FILE", help="settings, as `headvox config` prints them"
+    )
+    group.add_argument(
+        "--cascade", metavar="NAME|FILE", help="which masks to look with: see `headvox masks list`"
+    )
+    group.add_argument(
+        "--max-range", dest="max_range_m", type=number, metavar="M", help="drop farther points"
+    )
+    group.add_argument(
+        "--centre", nargs=3, type=number, metavar=("X", "Y", "Z"), help="what --max-range is measured from"
+    )
+    group.add_argument(
+        "--min-height", dest="min_height_m", type=number, metavar="M", help="drop lower points"
+    )
+    group.add_argument(
+        "--max-height", dest="max_height_m", type=number, metavar="M", help="drop higher points"
+    )
+    group.add_argument("--min-score", type=number, metavar="S", help="drop heads that score less")
+    group.add_argument("--voxel", dest="voxel_m", type=number, metavar="M", help="edge of a voxel")
+    group.add_argument("--refine", choices=("sphere", "none"), help="how a centre is sharpened")
+    group.add_argument(
+        "--threads", type=whole_number, metavar="N", help="threads for a frame; the heads are the same"
+    )
+
+
+# argparse names these three in its messages: "invalid number value: 'x'".
+
+
+def number(text: str) -> float:
+    """Return the finite number that ``text`` is."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected a finite number, got {text!r}")
+    return value
+
+
+def whole_number(text: str) -> int:
+    """Return the whole number, at least 1, that ``text`` is."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected at least 1, got {text!r}")
+    return value
+
+
+def output_file(text: str) -> Path:
+    """Return the path of a file that a sink can write."""
+    path = Path(text)
+    if path.suffix not in SUFFIXES:
+        raise argparse.ArgumentTypeError(
+            f"expected a name that ends with {' or '.join(SUFFIXES)}, got {text!r}"
+        )
+    return path
+
+
+if __name__ == "__main__":
+    sys.exit(main())

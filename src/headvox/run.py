@@ -1,0 +1,122 @@
+"""The loop: source -> detector -> sinks, and an account of how it went."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Protocol
+
+from headvox.data import BadFrame, Frame, Heads
+from headvox.errors import HeadvoxError
+from headvox.sinks import Result, Sink
+from headvox.sources import Source
+
+RECENT = 100_000  # frames that the percentiles look back over: a run may last for weeks
+
+
+class FrameDetector(Protocol):
+    """What the loop needs of a :class:`~headvox.pipeline.Detector`."""
+
+    stage_ms: dict[str, float]
+
+    def detect_frame(self, frame: Frame) -> Heads:
+        """Return the heads in one frame."""
+        ...
+
+
+def _recent() -> deque[float]:
+    return deque(maxlen=RECENT)
+
+
+@dataclass(slots=True)
+class Report:
+    """How a run went so far. ``stage_ms`` and ``latency_ms`` have a number for each good frame, the last ones."""
+
+    frames: int = 0
+    """Frames that the source gave, bad ones included."""
+    bad: int = 0
+    heads: int = 0
+    frames_with_heads: int = 0
+    seconds: float = 0.0
+    """Wall time of the whole loop: reading, detecting, writing."""
+    latency_ms: deque[float] = field(default_factory=_recent)
+    stage_ms: dict[str, deque[float]] = field(default_factory=dict)
+    last: Result | None = None
+    interrupted: bool = False
+
+    def add(self, result: Result, stage_ms: dict[str, float]) -> None:
+        """Count a good frame."""
+        self.heads += len(result.heads)
+        self.frames_with_heads += len(result.heads) > 0
+        self.latency_ms.append(result.latency_ms)
+        for stage, ms in stage_ms.items():
+            self.stage_ms.setdefault(stage, _recent()).append(ms)
+        self.last = result
+
+
+def run(
+    source: Source,
+    detector: FrameDetector,
+    sinks: Sequence[Sink] = (),
+    *,
+    strict: bool = False,
+    limit: int | None = None,
+    on_bad: Callable[[int, str], None] | None = None,
+    on_frame: Callable[[Report], None] | None = None,
+) -> Report:
+    """Run ``detector`` over ``source``, hand each result to every sink, and return what happened.
+
+    A frame that cannot be read or used is counted, told to ``on_bad`` (its index, the reason) and skipped.
+    ``on_frame`` is called after every frame. Ctrl-C ends the run as the end of the source does; ``interrupted``
+    tells. Neither source nor sinks are closed.
+
+    Args:
+        strict: end at the first bad frame.
+        limit: end after this many frames.
+
+    Raises:
+        HeadvoxError: no frame at all, none that could be used, or a bad one with ``strict``.
+    """
+    report = Report()
+    begun = time.perf_counter()
+    try:
+        for index, frame in enumerate(islice(iter(source), limit)):
+            report.frames += 1
+            try:
+                result = _detect(detector, frame, index)
+            except HeadvoxError as error:
+                report.bad += 1
+                if strict or source.length == 1:
+                    raise HeadvoxError(
+                        f"Frame {index}: {error.what}" if strict else error.what, error.do
+                    ) from error
+                if on_bad is not None:
+                    on_bad(index, str(error))
+            else:
+                report.add(result, detector.stage_ms)
+                for sink in sinks:
+                    sink.write(result)
+            report.seconds = time.perf_counter() - begun
+            if on_frame is not None:
+                on_frame(report)
+    except KeyboardInterrupt:
+        report.interrupted = True
+        return report
+    if report.frames == 0:
+        raise HeadvoxError(f"{source.name}: there is no frame in it.", "Check how it was recorded.")
+    if report.bad == report.frames:
+        raise HeadvoxError(
+            f"{source.name}: none of the {report.frames} frames could be used.", "The reasons are above."
+        )
+    return report
+
+
+def _detect(detector: FrameDetector, frame: Frame | BadFrame, index: int) -> Result:
+    if isinstance(frame, BadFrame):
+        raise HeadvoxError(frame.reason)
+    begun = time.perf_counter()
+    heads = detector.detect_frame(frame)
+    return Result(index, frame.stamp_ns, 1e3 * (time.perf_counter() - begun), heads)

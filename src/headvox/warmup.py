@@ -1,0 +1,55 @@
+"""Compile every loop that a detector runs, or load it from the disk: the first frame is then like any other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from headvox.config import DetectorConfig
+from headvox.data import Cloud, DepthImage, Frame, Intrinsics
+from headvox.gate import gate_columns
+from headvox.masks import CompiledCascade
+from headvox.pipeline import Detector
+
+_ANYTHING = 1 << 40
+
+
+def warm_up(config: DetectorConfig) -> None:
+    """Run a detector as ``config`` asks for, over a hand-sized cloud and a depth image of a few pixels.
+
+    Raises:
+        HeadvoxError: no such cascade.
+    """
+    near = replace(config, centre=(0.0, 0.0, 0.0), max_range_m=0.5, min_height_m=-0.5, max_height_m=0.5)
+    detector = Detector(replace(near, min_score=-1e6))
+    detector.cascade = _open(detector.cascade)
+    grid = np.arange(-0.1, 0.1, 0.02, dtype=np.float32)
+    points = np.ascontiguousarray(np.stack(np.meshgrid(grid, grid, grid), axis=-1).reshape(-1, 3))
+    wall = np.full((12, 16), 200, np.uint16)
+    camera = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0)
+    for writeable in (
+        True,
+        False,
+    ):  # Numba compiles a loop anew for arrays that lie in somebody else's buffer
+        points.flags.writeable = wall.flags.writeable = writeable
+        detector.detect_frame(Frame(0, clouds=(Cloud("warm-up", points),)))
+        detector.detect_frame(Frame(0, depths=(DepthImage("warm-up", wall, camera, np.eye(4)),)))
+    detector.close()
+
+
+def cache_folder() -> Path:
+    """Return the folder where the compiled loops are kept."""
+    return Path(gate_columns.stats.cache_path)  # type: ignore[attr-defined]
+
+
+def _open(cascade: CompiledCascade) -> CompiledCascade:
+    """Return ``cascade`` with all its doors open, so that each loop is run whatever the masks ask for."""
+    gate, votes, stages = cascade.gate, cascade.votes, cascade.stages
+    return replace(
+        cascade,
+        gate=replace(gate, low=np.zeros_like(gate.low), high=np.full_like(gate.high, _ANYTHING)),
+        votes=replace(votes, min_votes=0) if votes else None,
+        stages=replace(stages, stage_keep=np.full_like(stages.stage_keep, -_ANYTHING)) if stages else None,
+    )

@@ -18,10 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.data import F32, U16, Cloud, DepthImage
-from headvox.fuse import Region, placement
+from headvox.errors import HeadvoxError
+from headvox.fuse import Region
 from headvox.kernels import kernel
 
 NOWHERE = np.int32(-1)
+MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
 BLOCK = 1024  # points coded at a time: the codes stay in the first-level cache
 
 Cells = npt.NDArray[np.uint8] | npt.NDArray[np.uint32]
@@ -42,7 +44,11 @@ class Lattice:
 
     @classmethod
     def over(cls, region: Region, voxel_m: float, subdivision: int) -> Lattice:
-        """Return the lattice that covers ``region``."""
+        """Return the lattice that covers ``region``.
+
+        Raises:
+            HeadvoxError: more voxels than a grid can number.
+        """
         (cx, cy, _), radius = region.centre, region.radius_m
         ox, oy, oz = (
             math.floor(v / voxel_m) * voxel_m for v in (cx - radius, cy - radius, region.min_height_m)
@@ -51,6 +57,11 @@ class Lattice:
         # limit may round onto it.
         nx = ny = math.ceil(2 * radius / voxel_m) + 2
         nz = math.ceil((region.max_height_m - region.min_height_m) / voxel_m) + 2
+        if nx * ny * nz > MOST_CELLS:
+            raise HeadvoxError(
+                f"The region has {nx} x {ny} x {nz} voxels of {voxel_m:g} m: more than {MOST_CELLS} are not searched.",
+                "Set a smaller max_range_m, less height, or larger voxels.",
+            )
         return cls((ox, oy, oz), voxel_m, (nx, ny, nz), subdivision, region)
 
     @property
@@ -60,14 +71,15 @@ class Lattice:
 
     def limits(self) -> F32:
         """Return the region's limits in parts from the origin, as the kernels read them."""
-        limits = self.region.limits().astype(np.float64)
-        scale = 1.0 / self.part_m
+        # In float64 up to the last step: a centre in earth coordinates, rounded to float32 first, is off by more than the
+        # spare layer, and the kernels would write outside of the grid.
+        region, scale = self.region, 1.0 / self.part_m
         return np.array(
             [
-                *((limits[k] - self.origin[k]) * scale for k in range(3)),
-                limits[3] * scale * scale,
-                (limits[4] - self.origin[2]) * scale,
-                (limits[5] - self.origin[2]) * scale,
+                *((region.centre[k] - self.origin[k]) * scale for k in range(3)),
+                region.radius_m * region.radius_m * scale * scale,
+                (region.min_height_m - self.origin[2]) * scale,
+                (region.max_height_m - self.origin[2]) * scale,
             ],
             dtype=np.float32,
         )
@@ -247,7 +259,7 @@ class Rays:
 
 def part_transform(cloud: Cloud, lattice: Lattice) -> F32:
     """Return (4, 4) float32 from ``cloud``'s frame to parts from the lattice's origin."""
-    T = placement(cloud.T_world_sensor).astype(np.float64)
+    T = np.eye(4) if cloud.T_world_sensor is None else np.array(cloud.T_world_sensor, dtype=np.float64)
     T[:3, 3] -= np.array(lattice.origin)
     T[:3] /= lattice.part_m
     return T.astype(np.float32)

@@ -53,12 +53,14 @@ def gate_columns(S, first, last, boxes, start, rank, low, high, least, survivors
     sums = np.empty((most, nz), S.dtype)
     alive = np.empty(nz, np.uint8)
     found = 0
+    # A whole column may wrap around where no box does; a voxel has 8 parts at most.
+    fits = S.itemsize > 2 or (least[1] - least[0]) * (least[3] - least[2]) * nz * 8 <= 0xFFFF
     for x in range(first, last):
         wx0, wx1 = min(max(x + least[0], 0), nx), min(max(x + least[1], 0), nx)
         for y in range(ny):
             wy0, wy1 = min(max(y + least[2], 0), ny), min(max(y + least[3], 0), ny)
             window = (S[wx1, wy1, nz] - S[wx0, wy1, nz]) - (S[wx1, wy0, nz] - S[wx0, wy0, nz])
-            if (window & 0xFFFFFFFF) < least[4]:
+            if fits and (window & 0xFFFFFFFF) < least[4]:
                 continue
             alive[:] = 1
             any_alive = True

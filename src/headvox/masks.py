@@ -451,7 +451,7 @@ class CompiledCascade:
     votes: CompiledVotes | None
     stages: CompiledStages | None
     largest_sum: int
-    """Volume of the largest box in voxel parts: tells which integer type an integral volume needs."""
+    """Volume in voxel parts of the largest thing that is summed: tells which integer type an integral volume needs."""
 
 
 def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledCascade:
@@ -461,9 +461,16 @@ def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledC
     gate = _compile_gate(cascade, voxel, unit)
     votes = _compile_votes(cascade.votes, voxel) if cascade.votes else None
     stages = _compile_stages(cascade, voxel, unit) if cascade.stages else None
-    tables = [gate.boxes, *([votes.boxes] if votes else []), *([stages.boxes] if stages else [])]
-    largest = max(int(np.prod(t[:, 1::2] - t[:, 0::2], axis=1, dtype=np.int64).max()) for t in tables if len(t))
-    return CompiledCascade(cascade, voxel, gate, votes, stages, largest * unit)
+    # The gate adds up the boxes of a condition of rank 0 in the type of the volume; stage 2 adds up in 64 bits.
+    starts, ends = gate.start[:-1][gate.rank == 0], gate.start[1:][gate.rank == 0]
+    sums = [volume(gate.boxes[start:end]) for start, end in zip(starts, ends, strict=True)]
+    tables = [gate.boxes]
+    if votes:
+        tables += [votes.boxes, votes.pairs.reshape(-1, 6)]
+    if stages:
+        tables.append(stages.boxes)
+    sums += [volume(box[None]) for table in tables for box in table]
+    return CompiledCascade(cascade, voxel, gate, votes, stages, max(sums, default=1) * unit)
 
 
 def _box_table(boxes: list[list[int]]) -> I32:
@@ -479,9 +486,9 @@ def _compile_gate(cascade: Cascade, voxel: float, unit: int) -> CompiledGate:
     start, ranks, lows, highs = [0], [], [], []
     for condition in cascade.conditions:
         mine = [voxel_box(box, voxel) for box in condition.group.boxes]
-        size = volume(_box_table(mine)) * unit
+        size: float = volume(_box_table(mine)) * unit
         if condition.rank:
-            size //= len(mine)
+            size /= len(mine)
         boxes += mine
         start.append(len(boxes))
         ranks.append(condition.rank)
@@ -576,7 +583,7 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
         np.array(root, dtype=np.int32),
         np.array([0, *(sum(f <= s for f in first) for s in range(count))], dtype=np.int32),
         np.array(stage_trees, dtype=np.int32),
-        np.array([_floor(stage.keep * SCORE_UNIT) for stage in cascade.stages], dtype=np.int64),
+        np.array([-_floor(-stage.keep * SCORE_UNIT) for stage in cascade.stages], dtype=np.int64),
         min(seeing, default=count),
     )
 

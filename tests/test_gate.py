@@ -1,0 +1,142 @@
+import naive
+import numpy as np
+import pytest
+import scenes
+
+from headvox.gate import pass_gate
+from headvox.integral import integral_volume, integrate
+from headvox.masks import compile_cascade, load_cascade, parse_cascade, shipped_cascades
+
+HEAD = """
+format = "headvox-cascade"
+version = 1
+name = "gate"
+summary = "a gate for one test"
+voxel_m = 0.05
+subdivision = {subdivision}
+occupancy = "{occupancy}"
+min_score = 0.0
+[[group]]
+name = "g"
+boxes = [{{ centre = [0, 0, 0], size = [0.05, 0.05, 0.05] }}]
+[[stage]]
+name = "s"
+trees = [["g.sum", 0.0, 0.0, 1.0]]
+"""
+
+
+def cascade_with(gate: str, subdivision: int = 2, occupancy: str = "parts"):
+    return parse_cascade(HEAD.format(subdivision=subdivision, occupancy=occupancy) + gate, "test")
+
+
+def narrow(cells):
+    """Return the integral volume of ``cells`` in 16 bits."""
+    S = np.empty([n + 1 for n in cells.shape], np.uint16)
+    integrate(cells, np.array([0, 0, 0, *(n - 1 for n in cells.shape)]), cells.dtype != np.uint8, S)
+    return S
+
+
+def same_survivors(cells, cascade, voxel=None):
+    """Assert that the survivors equal those of the twin, in order; return them."""
+    compiled = compile_cascade(cascade, voxel)
+    wanted = naive.gate(naive.weights(cells), cascade, voxel or cascade.voxel_m)
+    survivors = pass_gate(integral_volume(cells), compiled.gate)
+    assert survivors.dtype == np.int32
+    np.testing.assert_array_equal(survivors, wanted)
+    if not cascade.counting and compiled.largest_sum <= 0xFFFF:
+        np.testing.assert_array_equal(pass_gate(narrow(cells), compiled.gate), wanted)
+    return survivors
+
+
+def random_cells(rng, shape, filled, counting=False):
+    cells = np.where(rng.random(shape) < filled, rng.integers(1, 6 if counting else 256, shape), 0)
+    return cells.astype(np.uint32 if counting else np.uint8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("filled", [0.02, 0.1, 0.4])
+@pytest.mark.parametrize("text", [scenes.STAGES, scenes.VOTES])
+def test_equals_the_naive_twin(seed, filled, text):
+    cascade = parse_cascade(text, "test")
+    cells = random_cells(np.random.default_rng(seed), (13, 11, 9), filled, cascade.counting)
+    same_survivors(cells, cascade)
+
+
+def test_lets_some_pass_and_stops_most():
+    cells = random_cells(np.random.default_rng(3), (13, 11, 9), 0.1)
+    cells[4:8] = 0
+    assert 100 < len(same_survivors(cells, parse_cascade(scenes.STAGES, "test"))) < 0.9 * cells.size
+
+
+@pytest.mark.parametrize("name", shipped_cascades())
+@pytest.mark.parametrize("filled", [0.05, 0.3])
+def test_shipped_cascades_equal_the_naive_twin(name, filled):
+    cascade = load_cascade(name)
+    rng = np.random.default_rng(4)
+    cells = random_cells(rng, (14, 12, 16), filled, cascade.counting)
+    if cascade.subdivision == 1 and not cascade.counting:
+        cells = np.minimum(cells, 1)
+    cells[rng.random(cells.shape[:2]) < 0.5] = 0
+    same_survivors(cells, cascade)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 20), (2, 9, 1), (20, 1, 3)])
+def test_boxes_reach_over_every_edge(shape):
+    rng = np.random.default_rng(5)
+    for filled in (0.0, 0.5, 1.0):
+        same_survivors(random_cells(rng, shape, filled), parse_cascade(scenes.STAGES, "test"))
+
+
+@pytest.mark.parametrize("rank", range(1, 9))
+def test_every_rank(rank):
+    ring = "ring = { radius = 0.12, height = 0.02, size = [0.1, 0.15, 0.05] }"
+    gate = f'[[gate]]\nname = "r"\n{ring}\nrank = {rank}\nmin = 0.1\nmax = 0.3\n'
+    cells = random_cells(np.random.default_rng(rank), (9, 10, 8), 0.3)
+    same_survivors(cells, cascade_with(gate))
+
+
+def test_ranks_of_boxes_of_different_sizes_share_the_mean_volume():
+    boxes = "[{centre=[0,0,0],size=[0.1,0.05,0.05]}, {centre=[0.1,0,0],size=[0.05,0.05,0.05]}]"
+    for low in (0.3, 0.34, 0.67):
+        gate = f'[[gate]]\nname = "r"\nboxes = {boxes}\nrank = 2\nmin = {low}\n'
+        same_survivors(random_cells(np.random.default_rng(0), (6, 6, 6), 0.6), cascade_with(gate, 1))
+
+
+@pytest.mark.parametrize("limits", ["min = 0.0\nmax = 0.0", "min = 1.0", "min = 0.5\nmax = 0.25", "max = 1e300", "min = 7e9"])
+def test_limits_at_their_ends(limits):
+    gate = f'[[gate]]\nname = "r"\nboxes = [{{ centre = [0.05, 0, 0], size = [0.1, 0.05, 0.05] }}]\n{limits}\n'
+    for filled in (0.0, 0.3, 1.0):
+        cells = random_cells(np.random.default_rng(0), (5, 6, 7), filled)
+        cells[cells > 0] = 255 if filled == 1.0 else cells[cells > 0]
+        same_survivors(cells, cascade_with(gate))
+
+
+def test_no_condition_lets_everything_pass():
+    cells = np.zeros((3, 4, 5), np.uint8)
+    assert len(same_survivors(cells, cascade_with(""))) == 60
+
+
+def test_a_sum_of_boxes_that_16_bits_cannot_hold():
+    """The type of the volume must fit the sums of a condition's boxes, not only each box."""
+    box = "{ centre = [0, 0, 0], size = [1.0, 1.0, 0.9] }"
+    gate = f'[[gate]]\nname = "r"\nboxes = [{", ".join([box] * 3)}]\nmin = 0.9\n'
+    cascade = cascade_with(gate)
+    cells = np.full((24, 24, 22), 255, np.uint8)
+    assert compile_cascade(cascade).largest_sum >= 3 * 20 * 20 * 18 * 8
+    assert len(same_survivors(cells, cascade)) > 0
+
+
+def test_a_column_that_16_bits_cannot_hold():
+    """A full column about a small box must not wrap around to "too few"."""
+    gate = '[[gate]]\nname = "r"\nboxes = [{ centre = [0, 0, 0], size = [0.8, 0.8, 0.1] }]\nmin = 0.9\n'
+    cells = np.full((20, 20, 40), 255, np.uint8)
+    layers = 0xFFFF // (16 * 16 * 8) + 1
+    cells[:, :, layers:] = 0
+    assert len(same_survivors(cells, cascade_with(gate))) > 0
+
+
+def test_a_million_points_in_one_cell():
+    cells = np.zeros((5, 5, 5), np.uint32)
+    cells[2, 2, 2] = 1_000_000
+    gate = '[[gate]]\nname = "r"\nboxes = [{ centre = [0, 0, 0], size = [0.15, 0.15, 0.15] }]\nmin = 37037.03\n'
+    assert len(same_survivors(cells, cascade_with(gate, 1, "count"))) == 27

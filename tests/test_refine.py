@@ -1,0 +1,82 @@
+import naive
+import numpy as np
+import pytest
+import scenes
+
+from headvox.data import Cloud
+from headvox.refine import MOST_PARTS, fit_spheres, skull_centres
+from headvox.voxelize import Lattice, voxelize_points
+
+
+def fitted(cells, peaks, voxel=0.05, subdivision=2, counting=False):
+    spheres = np.empty((len(peaks), 6))
+    points = np.empty((MOST_PARTS, 3))
+    fit_spheres(cells, np.array(peaks, np.int32), voxel, subdivision, counting, points, spheres)
+    return spheres
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("voxel", "subdivision", "counting"), [(0.05, 2, False), (0.05, 1, False), (0.025, 1, True)])
+def test_equals_the_naive_twin(seed, voxel, subdivision, counting):
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform(-0.05, 0.05, 3)
+    lattice = Lattice.over(scenes.region(), voxel, subdivision)
+    cells = voxelize_points(Cloud("b", scenes.bust(rng, centre)), lattice, counting)
+    middle = np.floor((centre - np.array(lattice.origin)) / voxel).astype(int)
+    peaks = [middle, middle + [1, 0, 0], middle - [0, 1, 1], [0, 0, 0], np.array(lattice.shape) - 1]
+    wanted = naive.fit_spheres(cells, peaks, voxel, subdivision)
+    spheres = fitted(cells, peaks, voxel, subdivision, counting)
+    np.testing.assert_allclose(spheres, wanted, rtol=1e-9, atol=1e-9)
+    assert spheres[0, 5] > 20
+
+
+def test_finds_the_centre_of_a_sphere():
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        centre = rng.uniform(-0.05, 0.05, 3)
+        lattice = Lattice.over(scenes.region(), 0.05, 2)
+        cells = voxelize_points(Cloud("s", scenes.shell(rng, centre, 0.095, 3000)), lattice)
+        peak = np.floor((centre - np.array(lattice.origin)) / 0.05).astype(np.int32)
+        sphere = fitted(cells, [peak])[0]
+        assert np.linalg.norm(lattice.centres(peak[None])[0] + sphere[:3] - centre) < 0.005
+        assert abs(sphere[3] - 0.095) < 0.005
+        assert sphere[4] < 0.012
+
+
+def test_nothing_near_leaves_the_centre_and_the_usual_radius():
+    sphere = fitted(np.zeros((9, 9, 9), np.uint8), [[4, 4, 4]])
+    np.testing.assert_allclose(sphere, [[0, 0, 0, 0.093, 0, 0]], atol=1e-12)
+
+
+def test_one_part_and_a_part_at_the_very_centre():
+    cells = np.zeros((9, 9, 9), np.uint8)
+    cells[6, 4, 4] = 1
+    np.testing.assert_allclose(fitted(cells, [[4, 4, 4]]), naive.fit_spheres(cells, [[4, 4, 4]], 0.05, 2), atol=1e-9)
+    lone = np.zeros((9, 9, 9), np.uint32)
+    lone[4, 4, 4] = 5
+    assert np.isfinite(fitted(lone, [[4, 4, 4]], 0.05, 1, True)).all()
+
+
+def test_a_full_grid_does_not_overrun_the_memory_for_its_points():
+    sphere = fitted(np.full((80, 80, 80), 255, np.uint8), [[40, 40, 40]], 0.01, 2)
+    assert sphere[0, 5] == MOST_PARTS
+    assert np.isfinite(sphere).all()
+
+
+def test_no_peak():
+    assert fitted(np.zeros((3, 3, 3), np.uint8), np.empty((0, 3))).shape == (0, 6)
+
+
+@pytest.mark.parametrize("sensors", [0, 1, 3])
+def test_skull_centres_equal_the_naive_twin(sensors):
+    rng = np.random.default_rng(sensors)
+    spheres, origins = rng.normal(size=(5, 3)), rng.normal(size=(sensors, 3))
+    moved = skull_centres(spheres, origins, 0.016, 0.006)
+    np.testing.assert_allclose(moved, naive.skull_centres(spheres, origins, 0.016, 0.006), atol=1e-12)
+
+
+def test_a_skull_lies_behind_its_seen_side():
+    moved = skull_centres(np.array([[2.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 1.0]]), 0.016, 0.006)
+    np.testing.assert_allclose(moved, [[2.016, 0.0, 1.006]])
+    at_sensor = skull_centres(np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 1.0]]), 0.016, 0.006)
+    np.testing.assert_allclose(at_sensor, [[0.0, 0.0, 1.006]])

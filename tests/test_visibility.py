@@ -1,0 +1,98 @@
+import naive
+import numpy as np
+import pytest
+import scenes
+
+from headvox.data import DepthImage, Intrinsics
+from headvox.visibility import count_seen
+from headvox.voxelize import Lattice
+
+REGION = scenes.region(0.6, -0.3, 0.5)
+BOXES = np.array([[-1, 2, -1, 2, -1, 2], [0, 1, 0, 1, 0, 1], [-3, -1, 2, 5, 0, 2], [-9, 9, 0, 1, 0, 1]], np.int32)
+
+
+def cameras(rng):
+    spheres = [(0.0, 0.0, 0.1, 0.1), (0.1, 0.3, 0.0, 0.15)]
+    return tuple(
+        scenes.image_of_spheres(rng, T, spheres, wall_m=1.5)
+        for T in (scenes.looking_along_x(-0.9, 0.0, 0.1), scenes.looking_along_x(-0.7, 0.2, 0.3))
+    )
+
+
+@pytest.mark.parametrize("subdivision", [1, 2])
+@pytest.mark.parametrize("count", [1, 2])
+def test_equals_the_naive_twin(subdivision, count):
+    rng = np.random.default_rng(count)
+    images = cameras(rng)[:count]
+    lattice = Lattice.over(REGION, 0.05, subdivision)
+    cells = np.column_stack([rng.integers(-2, n + 2, 40) for n in lattice.shape]).astype(np.int32)
+    seen = count_seen(images, lattice, cells, BOXES)
+    wanted = naive.count_seen(images, naive.lattice_over(REGION, 0.05, subdivision), cells, BOXES)
+    np.testing.assert_array_equal(seen, wanted)
+    assert seen[..., 0].max() > 5
+    assert seen[..., 1].max() > 5
+
+
+def test_turned_cameras_equal_the_naive_twin():
+    rng = np.random.default_rng(5)
+    camera = Intrinsics(30, 20, 12.0, 12.5, 14.7, 9.1, 0.0005)
+    images = tuple(
+        DepthImage(f"c{k}", rng.integers(0, 3000, (20, 30)).astype(np.uint16), camera, scenes.pose(rng))
+        for k in range(3)
+    )
+    lattice = Lattice.over(REGION, 0.05, 2)
+    cells = np.column_stack([rng.integers(0, n, 60) for n in lattice.shape]).astype(np.int32)
+    seen = count_seen(images, lattice, cells, BOXES)
+    np.testing.assert_array_equal(seen, naive.count_seen(images, naive.lattice_over(REGION, 0.05, 2), cells, BOXES))
+    assert seen.sum() > 100
+
+
+def test_before_the_surface_is_empty_and_behind_it_hidden():
+    """A wall 1 m before a camera at x = -1: what the channels are, in plain geometry."""
+    T = scenes.looking_along_x(-1.0, 0.0, 0.0)
+    depth = np.full((40, 60), 1000, np.uint16)
+    image = DepthImage("wall", depth, Intrinsics(60, 40, 30.0, 30.0, 29.5, 19.5), T)
+    lattice = Lattice.over(REGION, 0.05, 1)
+    one = np.array([[0, 1, 0, 1, 0, 1]], np.int32)
+    cells = np.array([[x, 12, 6] for x in range(lattice.shape[0])], np.int32)
+    x = lattice.centres(cells)[:, 0]
+    margin = 0.03 + 0.004 * (x + 1.0) ** 2
+    seen = count_seen((image,), lattice, cells, one)[:, 0]
+    np.testing.assert_array_equal(seen[:, 0], x < -margin)
+    np.testing.assert_array_equal(seen[:, 1], x > margin)
+
+
+def test_no_return_tells_nothing():
+    image = DepthImage("none", np.zeros((4, 4), np.uint16), Intrinsics(4, 4, 2.0, 2.0, 1.5, 1.5), np.eye(4))
+    lattice = Lattice.over(REGION, 0.05, 1)
+    cells = np.array([[12, 12, 12]], np.int32)
+    assert count_seen((image,), lattice, cells, BOXES).sum() == 0
+
+
+def test_behind_the_camera_and_beside_the_image_nothing_is_known():
+    T = scenes.looking_along_x(0.0, 0.0, 0.0)
+    image = DepthImage("one", np.full((1, 1), 65535, np.uint16), Intrinsics(1, 1, 500.0, 500.0, 0.0, 0.0), T)
+    lattice = Lattice.over(REGION, 0.05, 1)
+    everything = np.argwhere(np.ones(lattice.shape)).astype(np.int32)
+    seen = count_seen((image,), lattice, everything, np.array([[0, 1, 0, 1, 0, 1]], np.int32))[:, 0, 0]
+    assert lattice.centres(everything[seen > 0])[:, 0].min(initial=1.0) > 0.1
+
+
+def test_one_camera_that_sees_it_empty_outvotes_all_that_have_it_hidden():
+    camera = Intrinsics(20, 20, 10.0, 10.0, 9.5, 9.5)
+    near = DepthImage("near", np.full((20, 20), 300, np.uint16), camera, scenes.looking_along_x(-1.0, 0.0, 0.0))
+    far = DepthImage("far", np.full((20, 20), 3000, np.uint16), camera, scenes.looking_along_x(-1.0, 0.0, 0.0))
+    lattice = Lattice.over(REGION, 0.05, 1)
+    cells = np.array([[12, 12, 6]], np.int32)
+    one = BOXES[1:2]
+    assert count_seen((near,), lattice, cells, one).tolist() == [[[0, 1]]]
+    assert count_seen((far,), lattice, cells, one).tolist() == [[[1, 0]]]
+    assert count_seen((near, far), lattice, cells, one).tolist() == [[[1, 0]]]
+    assert count_seen((far, near), lattice, cells, one).tolist() == [[[1, 0]]]
+
+
+def test_no_camera_no_candidate_no_box():
+    lattice = Lattice.over(REGION, 0.05, 1)
+    none = np.empty((0, 3), np.int32)
+    assert count_seen((), lattice, np.array([[1, 1, 1]], np.int32), BOXES).sum() == 0
+    assert count_seen((), lattice, none, BOXES).shape == (0, 4, 2)

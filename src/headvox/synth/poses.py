@@ -277,17 +277,18 @@ def walking_pose(
 ) -> Pose:
     """Return the pose at one phase of a walk; the left heel strikes near phase 0, one cycle is two steps.
 
-    Cosine hips, a knee of two Gaussian bumps (loading and swing), arms against the legs, pelvis and chest
-    turning against each other. Angles in radians; ``stride`` 1 is a step of about 0.7 m for an adult.
+    Cosine hips, a knee of two Gaussian bumps (loading and swing; fitted so that the standing foot stays down and
+    the head bobs by 45 mm), arms against the legs, pelvis and chest turning against each other. Angles in
+    radians; ``stride`` 1 is a step of about 0.4 body heights, 0.8 one cycle.
     """
     legs, feet, arms = [], [], []
     for side, offset in ((1.0, 0.0), (-1.0, np.pi)):
         phase = (phase_rad + offset) % (2.0 * np.pi)
-        hip = stride * (0.10 + 0.40 * np.cos(phase))
-        knee = stride * (0.26 * _bump(phase, 0.75, 0.45) + 1.02 * _bump(phase, 4.55, 0.62)) + 0.06
+        hip = stride * (0.12 + 0.37 * np.cos(phase))
+        knee = stride * (0.30 * _bump(phase, 0.75, 0.45) + 1.03 * _bump(phase, 4.45, 0.67)) + 0.065
         shin = hip - knee
         legs.append(_limb((np.sin(hip), 0.035 * side, -np.cos(hip)), (np.sin(shin), 0.0, -np.cos(shin))))
-        feet.append(float(stride * (-0.30 * _bump(phase, 6.2, 0.4) + 0.75 * _bump(phase, 3.7, 0.5))))
+        feet.append(float(stride * (-0.30 * _bump(phase, 6.2, 0.4) + 0.69 * _bump(phase, 3.98, 0.39))))
         swing = arm_swing * (-0.05 - 0.32 * np.cos(phase))
         elbow = swing + 0.25 + 0.18 * arm_swing * max(0.0, -float(np.cos(phase)))
         arms.append(

@@ -30,11 +30,13 @@ class Sensor:
     ``baseline_m``   distance to the second imager or the projector; negative: it is on the left
     ``noise_px``     standard deviation of the disparity; ``noise_size_px`` how far neighbours share it
     ``step_px``      the disparity is delivered in such steps
-    ``wobble_px``    how far contours wander, because blocks of pixels are matched
+    ``fatten_px``    things grow by so much at their edges, because blocks of pixels are matched
+    ``wobble_px``    how far contours wander, for the same reason
     ``flying``       share of the pixels at an edge that lie between foreground and background
     ``shadow``       pixels that only one of imager and projector sees have no return
     ``weak``         signal that is still seen, as a share of what albedo 0.5 sends straight back from 4 m
-    ``edge_holes``   0..1, ragged holes along the edges of things
+    ``edge_holes``   0..1, ragged holes along the edges of things and of the image
+    ``hole_px``      how large the blobs are in which returns are lost
     ``salt``         share of the pixels lost for no reason
     ``near_m`` ``far_m``  the range that is delivered
     ``border_px``    columns and rows without return: left, right, top, bottom
@@ -45,11 +47,13 @@ class Sensor:
     noise_px: float = 0.0
     noise_size_px: float = 2.0
     step_px: float = 0.0
+    fatten_px: int = 0
     wobble_px: float = 0.0
     flying: float = 0.0
     shadow: bool = False
     weak: float = 0.0
     edge_holes: float = 0.0
+    hole_px: float = 4.0
     salt: float = 0.0
     near_m: float = 0.0
     far_m: float = 60.0
@@ -67,6 +71,7 @@ def d435i(rng: np.random.Generator | None = None) -> Sensor:
         noise_px=0.08,
         noise_size_px=2.0,
         step_px=1.0 / 32.0,
+        fatten_px=1,
         wobble_px=0.8,
         flying=0.35,
         shadow=True,
@@ -83,7 +88,9 @@ def d435i(rng: np.random.Generator | None = None) -> Sensor:
         usual,
         noise_px=float(rng.uniform(0.03, 0.08 + 0.10 * bad)),
         noise_size_px=float(rng.uniform(1.0, 3.5)),
+        fatten_px=int(rng.integers(0, 3)),
         wobble_px=float(rng.uniform(0.0, 0.6 + 1.2 * bad)),
+        hole_px=float(rng.uniform(2.0, 6.0)),
         flying=float(rng.uniform(0.0, 0.2 + 0.6 * bad)),
         shadow=bool(rng.uniform() < 0.85),
         weak=float(np.exp(rng.uniform(np.log(0.008), np.log(0.03 + 0.25 * bad)))),
@@ -99,8 +106,10 @@ def kinect(rng: np.random.Generator | None = None) -> Sensor:
         "kinect",
         baseline_m=0.075,
         noise_px=0.07,
-        noise_size_px=1.5,
+        noise_size_px=3.0,
+        hole_px=5.0,
         step_px=1.0 / 8.0,
+        fatten_px=1,
         wobble_px=1.5,
         flying=0.02,
         shadow=True,
@@ -117,9 +126,11 @@ def kinect(rng: np.random.Generator | None = None) -> Sensor:
     return replace(
         usual,
         baseline_m=0.075 if rng.uniform() < 0.5 else -0.075,
-        noise_px=float(rng.uniform(0.03, 0.08 + 0.06 * bad)),
-        noise_size_px=float(rng.uniform(1.0, 3.0)),
+        noise_px=float(rng.uniform(0.02, 0.06 + 0.06 * bad)),
+        noise_size_px=float(rng.uniform(1.5, 5.0)),
+        fatten_px=int(rng.integers(0, 3)),
         wobble_px=float(rng.uniform(0.5, 1.2 + 1.5 * bad)),
+        hole_px=float(rng.uniform(3.0, 8.0)),
         flying=float(rng.uniform(0.0, 0.06)),
         weak=float(np.exp(rng.uniform(np.log(0.01), np.log(0.05 + 0.25 * bad)))),
         edge_holes=float(rng.uniform(0.0, 0.3 + 0.7 * bad)),
@@ -153,13 +164,14 @@ def measure(
     with np.errstate(divide="ignore"):
         perfect = np.float32(focal_baseline) / view.distance_m  # nothing is infinitely far: disparity 0
     edges = edge_strength(perfect)
-    hole = weak_returns(view, sensor.weak, lasting, rng)
-    hole |= ragged_edges(edges, sensor.edge_holes, lasting, rng)
+    hole = weak_returns(view, sensor.weak, sensor.hole_px, lasting, rng)
+    hole |= ragged_edges(edges, sensor.edge_holes, sensor.hole_px, lasting, rng)
     hole |= salt(perfect.shape, sensor.salt, rng)
     hole |= border(perfect.shape, sensor.border_px)
     if sensor.shadow:
         hole |= shadow(perfect, sensor.baseline_m < 0.0)
-    disparity = wobble(perfect, sensor.wobble_px, rng)
+    disparity = fattened(perfect, sensor.fatten_px)
+    disparity = wobble(disparity, sensor.wobble_px, rng)
     disparity = flying_pixels(disparity, edges, sensor.flying, rng)
     disparity = noisy(disparity, sensor.noise_px, sensor.noise_size_px, rng)
     disparity = in_steps(disparity, sensor.step_px)
@@ -215,30 +227,40 @@ def shadow(disparity: F32, second_is_left: bool) -> Mask:
     columns = np.arange(disparity.shape[1], dtype=np.float32)
     if second_is_left:
         elsewhere = columns + disparity
-        behind = np.maximum.accumulate(elsewhere, axis=1)
-        return np.asarray(elsewhere < behind - 1.0)
-    elsewhere = columns - disparity
-    behind = np.minimum.accumulate(elsewhere[:, ::-1], axis=1)[:, ::-1]
-    return np.asarray(elsewhere > behind + 1.0)
+        dark = elsewhere < np.maximum.accumulate(elsewhere, axis=1) - 1.0
+    else:
+        elsewhere = columns - disparity
+        dark = elsewhere > np.minimum.accumulate(elsewhere[:, ::-1], axis=1)[:, ::-1] + 1.0
+    # Blocks of pixels are matched: slits between small steps of depth are bridged.
+    return np.asarray(ndimage.binary_opening(dark, np.ones((3, 3), np.bool_)))
 
 
-def weak_returns(view: View, weak: float, lasting: np.random.Generator, rng: np.random.Generator) -> Mask:
+def weak_returns(
+    view: View, weak: float, hole_px: float, lasting: np.random.Generator, rng: np.random.Generator
+) -> Mask:
     """Pixels whose light comes back too weak: dark, slanted or far surfaces, in blobs."""
     if weak <= 0.0:
         return np.zeros(view.ids.shape, np.bool_)
     with np.errstate(divide="ignore", invalid="ignore"):
         signal = (view.albedo / 0.5) * view.cosine * (SIGNAL_REFERENCE_M / view.distance_m) ** 2
         strength = np.log(signal / weak)
-    blobs = 0.45 * noise_field(lasting, view.ids.shape, 5.0) + 0.25 * noise_field(rng, view.ids.shape, 3.0)
+    shape = view.ids.shape
+    blobs = 0.45 * noise_field(lasting, shape, hole_px) + 0.25 * noise_field(rng, shape, 0.6 * hole_px)
     return np.asarray(~(strength + blobs > 0.0) & (view.ids != NOTHING))
 
 
-def ragged_edges(edges: F32, strength: float, lasting: np.random.Generator, rng: np.random.Generator) -> Mask:
-    """Ragged holes that eat into the edges of things."""
+def ragged_edges(
+    edges: F32, strength: float, hole_px: float, lasting: np.random.Generator, rng: np.random.Generator
+) -> Mask:
+    """Ragged holes that eat into the edges of things and of the image."""
     if strength <= 0.0:
         return np.zeros(edges.shape, np.bool_)
-    blobs = 0.7 * noise_field(lasting, edges.shape, 4.0) + 0.7 * noise_field(rng, edges.shape, 2.5)
-    return np.asarray((edges > 0.02) & (edges * 4.0 * strength + 0.6 * blobs > 1.0))
+    shape = edges.shape
+    blobs = 0.7 * noise_field(lasting, shape, hole_px) + 0.7 * noise_field(rng, shape, 0.6 * hole_px)
+    frame = np.zeros(shape, np.float32)
+    frame[:2], frame[-2:], frame[:, :2], frame[:, -2:] = 1.0, 1.0, 1.0, 1.0
+    reach = np.maximum(edges, ndimage.gaussian_filter(frame, 3.0, truncate=2.0))
+    return np.asarray((reach > 0.02) & (reach * 4.0 * strength + 0.6 * blobs > 1.0))
 
 
 def salt(shape: Shape, share: float, rng: np.random.Generator) -> Mask:
@@ -256,6 +278,14 @@ def border(shape: Shape, border_px: tuple[int, int, int, int]) -> Mask:
     outside = np.ones(shape, np.bool_)
     outside[top : shape[0] - bottom, left : shape[1] - right] = False
     return outside
+
+
+def fattened(disparity: F32, fatten_px: int) -> F32:
+    """Let near things cover ``fatten_px`` pixels more at their edges."""
+    if fatten_px <= 0:
+        return disparity
+    nearest = ndimage.maximum_filter(disparity, 2 * fatten_px + 1)
+    return np.where(nearest > 1.03 * np.maximum(disparity, 1.0), nearest, disparity)
 
 
 def wobble(disparity: F32, wobble_px: float, rng: np.random.Generator) -> F32:

@@ -315,5 +315,5 @@ def _is_number(value: Any) -> bool:
 def _short(value: Any) -> str:
     """Show a JSON value in a message, however large or deep it is."""
     if isinstance(value, (dict, list)):
-        return f"a {'list' if isinstance(value, list) else 'object'} of {len(value)}"
+        return f"{'a list' if isinstance(value, list) else 'an object'} of {len(value)}"
     return repr(value)[:60] if not isinstance(value, int) or abs(value) < 2**70 else "a huge number"

@@ -33,7 +33,7 @@ def _recent() -> deque[float]:
 
 @dataclass(slots=True)
 class Report:
-    """How a run went so far. ``stage_ms`` and ``latency_ms`` have a number for each good frame, the last ones."""
+    """How a run went so far; ``stage_ms`` and ``latency_ms`` have a number for each of the last frames."""
 
     frames: int = 0
     """Frames that the source gave, bad ones included."""
@@ -70,8 +70,8 @@ def run(
     """Run ``detector`` over ``source``, hand each result to every sink, and return what happened.
 
     A frame that cannot be read or used is counted, told to ``on_bad`` (its index, the reason) and skipped.
-    ``on_frame`` is called after every frame. Ctrl-C ends the run as the end of the source does; ``interrupted``
-    tells. Neither source nor sinks are closed.
+    ``on_frame`` is called after every frame. Ctrl-C ends the run as the end of the source does, the
+    report tells. Neither source nor sinks are closed.
 
     Args:
         strict: end at the first bad frame.

@@ -1,4 +1,4 @@
-"""Compile every loop that a detector runs, or load it from the disk: the first frame is then like any other."""
+"""Compile every loop that a detector runs, or load it from the disk, before the first frame comes."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ DIGITS = 6
 
 
 class JsonStream:
-    """Writes to an open text stream, each line at once: the reader of a pipe never waits for the next frame."""
+    """Writes to an open text stream, each line at once: the reader of a pipe does not wait for the next."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

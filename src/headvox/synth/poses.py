@@ -277,9 +277,9 @@ def walking_pose(
 ) -> Pose:
     """Return the pose at one phase of a walk; the left heel strikes near phase 0, one cycle is two steps.
 
-    Cosine hips, a knee of two Gaussian bumps (loading and swing; fitted so that the standing foot stays down and
-    the head bobs by 45 mm), arms against the legs, pelvis and chest turning against each other. Angles in
-    radians; ``stride`` 1 is a step of about 0.4 body heights, 0.8 one cycle.
+    Cosine hips, a knee of two Gaussian bumps (loading and swing; fitted so that the standing foot stays down
+    and the head bobs by 45 mm), arms against the legs, pelvis and chest turning against each other. Angles in
+    radians; with ``stride`` 1 a step is about 0.4 body heights long, a cycle 0.8.
     """
     legs, feet, arms = [], [], []
     for side, offset in ((1.0, 0.0), (-1.0, np.pi)):

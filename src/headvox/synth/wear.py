@@ -50,6 +50,7 @@ class Wear:
     hair_length_m: float = 0.0
     hair_albedo: float = 0.2
     receding: float = 0.0
+    fringe: float = 0.0
     beard_m: float = 0.0
     hat: str = "none"
     hat_m: float = 0.008
@@ -57,6 +58,7 @@ class Wear:
     glasses: str = "none"  # none, clear, dark
     mask: bool = False
     headphones: bool = False
+    scarf_m: float = 0.0
     cloth_m: float = 0.01
     sleeves: float = 1.0
     trousers: float = 1.0
@@ -109,6 +111,7 @@ def sample_wear(rng: np.random.Generator, sex: float, age_years: float) -> Wear:
         hair_length_m=float(rng.uniform(0.12, 0.38)),
         hair_albedo=float(np.clip((1.0 - grey) * rng.beta(1.2, 3.0) + grey * 0.8, 0.02, 0.95)),
         receding=float(rng.beta(0.6, 2.0)) if adult_man else float(0.15 * rng.random()),
+        fringe=float(rng.beta(0.7, 2.2 if not female else 1.3)),
         beard_m=float(rng.choice((0.003, 0.008, 0.015, 0.03), p=(0.4, 0.3, 0.2, 0.1))) if beard else 0.0,
         hat=hat,
         hat_m=float(rng.uniform(*hat_wall)),
@@ -116,6 +119,7 @@ def sample_wear(rng: np.random.Generator, sex: float, age_years: float) -> Wear:
         glasses=("none", "clear", "dark")[int(rng.choice(3, p=(0.68, 0.26, 0.06)))],
         mask=bool(rng.random() < 0.06),
         headphones=bool(rng.random() < 0.06) and hat in ("none", "beanie"),
+        scarf_m=float(rng.uniform(0.015, 0.04)) if rng.random() < 0.06 else 0.0,
         cloth_m=float(0.005 + 0.035 * rng.beta(1.1, 2.2)),
         sleeves=float(rng.choice((0.15, 0.3, 0.6, 1.0), p=(0.1, 0.3, 0.1, 0.5))),
         trousers=float(rng.choice((0.25, 0.5, 1.0), p=(0.1, 0.15, 0.75))),
@@ -131,15 +135,17 @@ def dress(body: RestBody, wear: Wear) -> Outfit:
     vertices, materials = _clothe(body, wear, rng)
     pieces: list[Piece] = []
     if wear.hair != "bald":
-        pieces += _hair(body, head, wear, rng)
+        pieces += _hair(body, vertices, head, wear, rng)
     if wear.hat != "none":
-        pieces += _hat(body, head, wear)
+        pieces += _hat(body, vertices, head, wear)
     if wear.glasses != "none":
         pieces += _glasses(body, wear.glasses == "dark")
     if wear.mask:
         pieces.append(_mask(head))
     if wear.headphones:
         pieces += _headphones(body, head, wear)
+    if wear.scarf_m > 0.0:
+        pieces.append(_scarf(body, vertices, wear))
     return _assemble(vertices, materials, pieces, basis.joint("head"), basis.joint("spine01"))
 
 
@@ -307,6 +313,7 @@ def _shell(
 
 def _curtain(
     body: RestBody,
+    clothed: F64,
     azimuth: F64,
     top_z: float,
     length_m: F64,
@@ -314,45 +321,53 @@ def _curtain(
     material: int,
     rng: np.random.Generator,
 ) -> Piece:
-    """Hang a sheet round the back of head and neck, outside of the trunk, down to ``length_m`` or to a
-    shoulder.
+    """Hang a sheet round the back of head and neck, outside of the trunk, down to a length or a shoulder.
 
-    ``azimuth`` and ``length_m`` are (columns,). The lower it hangs, the more it follows the chest.
+    ``clothed`` (V, 3) are the vertices of the dressed body; ``azimuth`` and ``length_m`` are (columns,). The
+    lower it hangs, the more it follows the chest.
     """
-    basis = load_basis()
-    arm_joints = [
-        i
-        for i, n in enumerate(basis.joint_names)
-        if n.startswith(("upperarm02", "lowerarm", "wrist", "finger"))
-    ]
-    trunk = ~np.isin(basis.skin_joints[:, 0], arm_joints) & (
-        body.vertices[:, 2] > top_z - length_m.max() - 0.03
-    )
-    axis = body.head_centre[:2] - (0.1 * body.head_size[0], 0.0)
-    offset = body.vertices[trunk, :2] - axis
-    reach = np.hypot(offset[:, 0], offset[:, 1])
-    bearing = np.arctan2(offset[:, 1], offset[:, 0])
-    height = body.vertices[trunk, 2]
     rows = 16
     z = top_z - np.linspace(0.0, 1.0, rows)[:, None] * length_m
+    axis = body.head_centre[:2] - (0.1 * body.head_size[0], 0.0)
+    profile = _trunk_radius(clothed, axis, np.tile(azimuth, (rows, 1)), z)
+    fall = length_m / (rows - 1)
     radius = np.empty_like(z)
     alive = np.ones_like(z, dtype=bool)
-    for column, angle in enumerate(azimuth):
-        beside = np.abs((bearing - angle + np.pi) % (2.0 * np.pi) - np.pi) < 0.22
-        for row in range(rows):
-            near = beside & (np.abs(height - z[row, column]) < 0.02)
-            body_radius = reach[near].max() + stand_off if near.any() else 0.0
-            before = radius[row - 1, column] if row else body_radius
-            alive[row, column] = body_radius < before + 0.03 and (row == 0 or alive[row - 1, column])
-            radius[row, column] = max(body_radius, before - 0.004) if alive[row, column] else before
+    radius[0] = profile[0] + stand_off
+    for row in range(1, rows):
+        alive[row] = alive[row - 1] & (profile[row] + stand_off < radius[0] + 0.025)
+        drawn_in = radius[row - 1] - 0.35 * fall  # hair below the skull falls inwards again
+        radius[row] = np.where(alive[row], np.maximum(profile[row] + stand_off, drawn_in), radius[row - 1])
     plain = np.stack([axis[0] + radius * np.cos(azimuth), axis[1] + radius * np.sin(azimuth), z], axis=-1)
     radius = radius + 0.35 * stand_off * smooth_noise(plain, rng, 0.05)
     points = np.stack([axis[0] + radius * np.cos(azimuth), axis[1] + radius * np.sin(azimuth), z], axis=-1)
     faces = _grid_faces(rows, len(azimuth), closed=False)[:, ::-1]
-    shoulder_z = body.joints[basis.joint("upperarm01.L"), 2]
-    chin_z = body.vertices[basis.menton, 2]
-    share = 0.85 * (1.0 - _ramp(points[..., 2].ravel(), shoulder_z, chin_z))
+    share = 0.85 * _chest_share(body, points[..., 2].ravel())
     return Piece(points.reshape(-1, 3), faces[alive.ravel()[faces].all(1)], material, share)
+
+
+def _chest_share(body: RestBody, z: F64) -> F64:
+    """Return how far things at a height follow the chest: 0 at the chin and above, 1 at the shoulders."""
+    basis = load_basis()
+    shoulder_z, chin_z = body.joints[basis.joint("upperarm01.L"), 2], body.vertices[basis.menton, 2]
+    return 1.0 - _ramp(z, shoulder_z, chin_z)
+
+
+def _trunk_radius(clothed: F64, axis: F64, azimuth: F64, z: F64) -> F64:
+    """Return how far head, neck and trunk reach from an upright axis (2,) at each azimuth and height."""
+    basis = load_basis()
+    arms = ("upperarm02", "lowerarm", "wrist", "finger")
+    limbs = [i for i, name in enumerate(basis.joint_names) if name.startswith(arms)]
+    part = ~np.isin(basis.skin_joints[:, 0], limbs) & (clothed[:, 2] > z.min() - 0.03)
+    offset = clothed[part, :2] - axis
+    reach, bearing = np.hypot(offset[:, 0], offset[:, 1]), np.arctan2(offset[:, 1], offset[:, 0])
+    height = clothed[part, 2]
+    out = np.zeros(z.shape)
+    for column in range(z.shape[1]):
+        beside = np.abs((bearing - azimuth[0, column] + np.pi) % (2.0 * np.pi) - np.pi) < 0.22
+        near = np.abs(height[beside][None, :] - z[:, column, None]) < 0.02
+        out[:, column] = np.where(near, reach[beside][None, :], 0.0).max(1, initial=0.0)
+    return out
 
 
 # ---------------------------------------------------------------------------------------------- clothes
@@ -430,10 +445,16 @@ def _beard_cover(body: RestBody) -> F64:
 # ---------------------------------------------------------------------------------------------- on the head
 
 
-def _hair(body: RestBody, head: HeadField, wear: Wear, rng: np.random.Generator) -> list[Piece]:
+def _hair(body: RestBody, clothed: F64, head: HeadField, wear: Wear, rng: np.random.Generator) -> list[Piece]:
     azimuth = _around(N_AZIMUTH)
     thickness = min(wear.hair_m, 0.005) if wear.hat != "none" else wear.hair_m
     rim = _rim("hair", azimuth) + wear.receding * np.radians(38.0) * _ramp(np.cos(azimuth), 0.0, 0.8)
+    falls = (
+        wear.fringe
+        * (1.0 - wear.receding)
+        * np.interp(np.abs(np.cos(azimuth)), (0.0, 0.5, 1.0), (24.0, 14.0, 26.0))
+    )
+    rim = rim - np.radians(falls) * _ramp(np.cos(azimuth), -0.5, 0.0)
     rim = rim + np.radians(3.0) * smooth_noise(_directions(azimuth, np.zeros_like(azimuth)), rng, 0.8)
 
     def wall(theta: F64, elevation: F64) -> F64:
@@ -444,10 +465,10 @@ def _hair(body: RestBody, head: HeadField, wear: Wear, rng: np.random.Generator)
 
     pieces = [_shell(head, rim, wall, HAIR, taper=wear.hair != "long")]
     if wear.hair == "long":
-        back = np.radians(np.linspace(rng.uniform(60.0, 85.0), 360.0 - rng.uniform(60.0, 85.0), 27))
+        back = np.radians(np.linspace(rng.uniform(48.0, 85.0), 360.0 - rng.uniform(48.0, 85.0), 27))
         length = wear.hair_length_m * (1.0 + 0.08 * smooth_noise(_directions(back, 0.0 * back), rng, 0.5))
         top = body.head_centre[2] + 0.1 * body.head_size[2]
-        pieces.append(_curtain(body, back, top, length, max(0.008, wear.hair_m), HAIR, rng))
+        pieces.append(_curtain(body, clothed, back, top, length, max(0.008, wear.hair_m), HAIR, rng))
     if wear.hair == "bun" and wear.hat in ("none", "cap"):
         pieces.append(_bun(head, wear, rng))
     if wear.hair == "ponytail":
@@ -478,7 +499,7 @@ def _ponytail(body: RestBody, head: HeadField, wear: Wear, rng: np.random.Genera
     )
 
 
-def _hat(body: RestBody, head: HeadField, wear: Wear) -> list[Piece]:
+def _hat(body: RestBody, clothed: F64, head: HeadField, wear: Wear) -> list[Piece]:
     rng = np.random.default_rng([wear.seed, 1])
     azimuth = _around(N_AZIMUTH)
     under = 0.006  # flattened hair
@@ -503,7 +524,7 @@ def _hat(body: RestBody, head: HeadField, wear: Wear) -> list[Piece]:
     if wear.hat == "hood":
         back = np.radians(np.linspace(62.0, 298.0, 27))
         top = body.head_centre[2] - 0.1 * body.head_size[2]
-        pieces.append(_curtain(body, back, top, np.full(27, 0.15), under + wear.hat_m, HAT, rng))
+        pieces.append(_curtain(body, clothed, back, top, np.full(27, 0.15), under + wear.hat_m, HAT, rng))
     return pieces
 
 
@@ -591,3 +612,19 @@ def _headphones(body: RestBody, head: HeadField, wear: Wear) -> list[Piece]:
     band[:, 0] = ears[0][0] + 0.005
     pieces.append(_tube(band, 0.007, HAT))
     return pieces
+
+
+def _scarf(body: RestBody, clothed: F64, wear: Wear) -> Piece:
+    """Wind a soft ring round the neck."""
+    basis = load_basis()
+    rng = np.random.default_rng([wear.seed, 3])
+    neck = body.joints[basis.joint("neck02")]
+    azimuth = _around(28)
+    z = neck[2] - 0.01 + 0.02 * np.cos(azimuth + rng.uniform(-0.6, 0.6)) * -1.0
+    reach = _trunk_radius(clothed, neck[:2], azimuth[None, :], z[None, :])[0]
+    reach = np.minimum(reach, np.median(reach) + 0.03) + 0.4 * wear.scarf_m
+    path = np.column_stack([neck[0] + reach * np.cos(azimuth), neck[1] + reach * np.sin(azimuth), z])
+    ring = _tube(
+        path, wear.scarf_m * (1.0 + 0.25 * smooth_noise(path, rng, 0.06)), CLOTH, closed=True, sides=10
+    )
+    return Piece(ring.vertices, ring.faces, CLOTH, np.full(len(ring.vertices), 0.75))

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -37,6 +38,8 @@ STATISTICS = ("min", "low", "high", "max", "sum")  # smallest, 3rd smallest, 3rd
 SCORE_UNIT = 1024
 MAX_FILE_BYTES = 8 << 20
 MAX_EXTENT_M = 2.0
+MAX_SEEN_CELLS = 1 << 20
+LARGEST = 1e9  # of shares and scores: their sums stay far within 64 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +170,7 @@ def parse_cascade(text: str, origin: str) -> Cascade:
     """Return the cascade that the TOML ``text`` describes; ``origin`` names it in errors."""
     try:
         table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, or a whole number of too many digits
         raise HeadvoxError(f"Cascade {origin} is not TOML: {error}.", "Check that line.") from None
     return _Reader(origin).cascade(table)
 
@@ -179,7 +182,10 @@ class _Reader:
         self.origin = origin
 
     def error(self, where: str, expected: str, got: object) -> HeadvoxError:
-        shown = repr(got)
+        try:
+            shown = repr(got)
+        except ValueError:  # Python does not write whole numbers of more than 4300 digits
+            shown = "a number of thousands of digits"
         shown = shown if len(shown) < 80 else shown[:77] + "..."
         return HeadvoxError(f"Cascade {self.origin}: {where}: expected {expected}, got {shown}.", "Mend the file.")
 
@@ -196,11 +202,14 @@ class _Reader:
             raise self.error(where, "a list", value)
         return value
 
-    def number(self, value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
-        good = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not good or not low <= value <= high:  # type: ignore[operator]
+    def number(self, value: object, where: str, low: float = -LARGEST, high: float = LARGEST) -> float:
+        number = math.nan
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            with suppress(OverflowError):
+                number = float(value)
+        if not low <= number <= high:
             raise self.error(where, f"a number from {low:g} to {high:g}", value)
-        return float(value)  # type: ignore[arg-type]
+        return number
 
     def whole(self, value: object, where: str, low: int, high: int) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
@@ -219,17 +228,18 @@ class _Reader:
         x, y, z = (self.number(v, where, low, high) for v in values)
         return x, y, z
 
-    def box(self, value: object, where: str) -> Box:
-        table = self.table(value, where, {"centre", "size", "weight"})
+    def box(self, value: object, where: str, weighted: bool = False) -> Box:
+        table = self.table(value, where, {"centre", "size", "weight"} if weighted else {"centre", "size"})
         centre = self.triple(table.get("centre"), f"{where}.centre", -MAX_EXTENT_M, MAX_EXTENT_M)
         size = self.triple(table.get("size"), f"{where}.size", 0.0, MAX_EXTENT_M)
         return Box(centre, size, self.whole(table.get("weight", 1), f"{where}.weight", -1000, 1000))
 
-    def boxes(self, table: dict[str, Any], where: str) -> tuple[Box, ...]:
+    def boxes(self, table: dict[str, Any], where: str, weighted: bool = False) -> tuple[Box, ...]:
         if ("ring" in table) == ("boxes" in table):
             raise self.error(where, "either boxes or ring", sorted(table))
         if "boxes" in table:
-            boxes = tuple(self.box(box, f"{where}.boxes") for box in self.items(table["boxes"], f"{where}.boxes"))
+            entries = self.items(table["boxes"], f"{where}.boxes")
+            boxes = tuple(self.box(entry, f"{where}.boxes", weighted) for entry in entries)
         else:
             boxes = self.ring(table["ring"], f"{where}.ring")
         if not 1 <= len(boxes) <= 64:
@@ -252,7 +262,7 @@ class _Reader:
             Group(name, boxes),
             self.whole(table.get("rank", 0), f"gate {name}.rank", 0, len(boxes)),
             self.number(table.get("min", 0.0), f"gate {name}.min"),
-            self.number(table.get("max", math.inf), f"gate {name}.max"),
+            self.number(table.get("max", math.inf), f"gate {name}.max", 0.0, math.inf),
         )
 
     def group(self, value: object, where: str) -> Group:
@@ -272,7 +282,7 @@ class _Reader:
         for entry in self.items(table.get("mask"), "votes.mask"):
             mask = self.table(entry, "votes.mask", {"name", "boxes"})
             name = self.text(mask.get("name"), "votes.mask.name")
-            masks.append(Mask(name, self.boxes(mask, f"mask {name}")))
+            masks.append(Mask(name, self.boxes(mask, f"mask {name}", weighted=True)))
         pairs = []
         for entry in self.items(table.get("mirrored", []), "votes.mirrored"):
             pair = self.items(entry, "votes.mirrored")
@@ -286,7 +296,7 @@ class _Reader:
             tuple(masks),
             tuple(pairs),
             tuple(self.number(yaw, "votes.yaws_deg", -360.0, 360.0) for yaw in yaws),
-            self.number(table.get("asymmetry_cost", 0.0), "votes.asymmetry_cost", 0.0),
+            self.number(table.get("asymmetry_cost", 0.0), "votes.asymmetry_cost", 0.0, 1e6),
             self.whole(table.get("min_votes", 0), "votes.min_votes", 0, len(masks)),
         )
 
@@ -312,7 +322,7 @@ class _Reader:
         trees = self.items(table.get("trees"), f"stage {name}.trees")
         return Stage(
             name,
-            self.number(table.get("keep", -math.inf), f"stage {name}.keep"),
+            self.number(table.get("keep", -math.inf), f"stage {name}.keep", -math.inf, math.inf),
             tuple(self.tree(tree, features, f"stage {name}.trees") for tree in trees),
         )
 
@@ -325,16 +335,26 @@ class _Reader:
         occupancy = self.text(table.get("occupancy"), "occupancy")
         if occupancy not in ("parts", "count"):
             raise self.error("occupancy", '"parts" or "count"', occupancy)
+        subdivision = self.whole(table.get("subdivision", 1), "subdivision", 1, 2)
+        if occupancy == "count" and subdivision > 1:
+            raise self.error("subdivision", '1, as occupancy is "count"', subdivision)
+        if table.get("stage") == []:
+            raise self.error("stage", "at least one stage", [])
         if ("votes" in table) == ("stage" in table):
             raise self.error("the file", "either votes or stages", sorted(table))
         groups = tuple(self.group(entry, "group") for entry in self.items(table.get("group", []), "group"))
+        names: set[str] = set()
+        for group in groups:
+            if group.name in names:
+                raise self.error(f"group {group.name}", "a name of its own", group.name)
+            names.add(group.name)
         features = {f"{group.name}.{statistic}" for group in groups for statistic in statistics(group)}
         min_score = self.number(table.get("min_score"), "min_score")
         return Cascade(
             name=self.text(table.get("name"), "name"),
             summary=self.text(table.get("summary"), "summary"),
             voxel_m=self.number(table.get("voxel_m"), "voxel_m", 0.005, 0.2),
-            subdivision=self.whole(table.get("subdivision", 1), "subdivision", 1, 2),
+            subdivision=subdivision,
             counting=occupancy == "count",
             conditions=tuple(self.condition(entry, "gate") for entry in self.items(table.get("gate", []), "gate")),
             votes=self.votes(table["votes"]) if "votes" in table else None,
@@ -540,6 +560,14 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
         cells = volume(_box_table(mine)) * (unit if group.channel == "occupied" else 1)
         for statistic in statistics(group):
             sizes[f"{group.name}.{statistic}"] = cells if statistic == "sum" else cells / len(mine)
+
+    seen = [voxel_box(box, voxel) for group, _ in groups if group.channel != "occupied" for box in group.boxes]
+    if volume(_box_table(seen)) > MAX_SEEN_CELLS:
+        raise HeadvoxError(
+            f'Cascade {cascade.name}: its "empty" and "hidden" boxes have {volume(_box_table(seen))} cells of {voxel:g} m, '
+            f"more than {MAX_SEEN_CELLS}.",
+            "Make them smaller or fewer, or the voxels larger.",
+        )
 
     feature: list[int] = []
     cut: list[int] = []

@@ -117,7 +117,8 @@ class Grid:
                     depth = f32(image.depth[v, u])
                     across = (u - camera.cx) / camera.fx
                     ray = [
-                        f32((T[k, 0] * across + T[k, 2]) * scale) + f32(T[k, 1] * down * scale) for k in range(3)
+                        f32((T[k, 0] * across + T[k, 2]) * scale) + f32(T[k, 1] * down * scale)
+                        for k in range(3)
                     ]
                     self.enter(*(t[k] + depth * ray[k] for k in range(3)))
 
@@ -358,7 +359,9 @@ def suppress(cells: np.ndarray, scores: np.ndarray, least: int) -> np.ndarray:
     for i in range(len(cells)):
         beaten = scores[i] < least
         for j in range(len(cells)):
-            neighbours = i != j and max(abs(int(a) - int(b)) for a, b in zip(cells[i], cells[j], strict=True)) <= 1
+            neighbours = (
+                i != j and max(abs(int(a) - int(b)) for a, b in zip(cells[i], cells[j], strict=True)) <= 1
+            )
             if neighbours and (scores[j] > scores[i] or (scores[j] == scores[i] and j < i)):
                 beaten = True
         if not beaten:
@@ -462,7 +465,9 @@ def detect(frame: Frame, cascade: Cascade, region: Region, min_score: float | No
     peaks = suppress(candidates, scores, DROPPED + 1)
 
     seeing = {group.name for group in cascade.groups if group.channel != "occupied"}
-    asks = {n.rsplit(".", 1)[0] for stage in cascade.stages for tree in stage.trees for n in names_in(tree)} & seeing
+    asks = {
+        n.rsplit(".", 1)[0] for stage in cascade.stages for tree in stage.trees for n in names_in(tree)
+    } & seeing
     sees = bool(asks) and bool(frame.depths) and not frame.clouds
     if sees:
         states = States(frame.depths, lattice)

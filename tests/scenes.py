@@ -151,7 +151,9 @@ def shell(rng: np.random.Generator, centre, radius: float, count: int) -> np.nda
 
 def bust(rng: np.random.Generator, centre, count: int = 600) -> np.ndarray:
     """Return points on a head about ``centre`` and on the shoulders below it."""
-    shoulders = shell(rng, (0, 0, 0), 1.0, count) * np.array([0.12, 0.22, 0.1]) + np.array(centre) - [0, 0, 0.25]
+    shoulders = (
+        shell(rng, (0, 0, 0), 1.0, count) * np.array([0.12, 0.22, 0.1]) + np.array(centre) - [0, 0, 0.25]
+    )
     return np.concatenate([shell(rng, centre, 0.095, count), shoulders]).astype(np.float32)
 
 

@@ -102,9 +102,13 @@ def test_ranks_of_boxes_of_different_sizes_share_the_mean_volume():
         same_survivors(random_cells(np.random.default_rng(0), (6, 6, 6), 0.6), cascade_with(gate, 1))
 
 
-@pytest.mark.parametrize("limits", ["min = 0.0\nmax = 0.0", "min = 1.0", "min = 0.5\nmax = 0.25", "max = 1e300", "min = 7e9"])
+@pytest.mark.parametrize(
+    "limits", ["min = 0.0\nmax = 0.0", "min = 1.0", "min = 0.5\nmax = 0.25", "max = inf", "min = 1e9"]
+)
 def test_limits_at_their_ends(limits):
-    gate = f'[[gate]]\nname = "r"\nboxes = [{{ centre = [0.05, 0, 0], size = [0.1, 0.05, 0.05] }}]\n{limits}\n'
+    gate = (
+        f'[[gate]]\nname = "r"\nboxes = [{{ centre = [0.05, 0, 0], size = [0.1, 0.05, 0.05] }}]\n{limits}\n'
+    )
     for filled in (0.0, 0.3, 1.0):
         cells = random_cells(np.random.default_rng(0), (5, 6, 7), filled)
         cells[cells > 0] = 255 if filled == 1.0 else cells[cells > 0]
@@ -138,5 +142,7 @@ def test_a_column_that_16_bits_cannot_hold():
 def test_a_million_points_in_one_cell():
     cells = np.zeros((5, 5, 5), np.uint32)
     cells[2, 2, 2] = 1_000_000
-    gate = '[[gate]]\nname = "r"\nboxes = [{ centre = [0, 0, 0], size = [0.15, 0.15, 0.15] }]\nmin = 37037.03\n'
+    gate = (
+        '[[gate]]\nname = "r"\nboxes = [{ centre = [0, 0, 0], size = [0.15, 0.15, 0.15] }]\nmin = 37037.03\n'
+    )
     assert len(same_survivors(cells, cascade_with(gate, 1, "count"))) == 27

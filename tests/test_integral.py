@@ -78,7 +78,9 @@ def test_a_million_points_in_one_cell():
     cells = np.zeros((3, 3, 3), np.uint32)
     cells[1, 1, 1] = 1_000_000
     S = integral_volume(cells)
-    assert box_sums(S, np.array([[-9, 9, -9, 9, -9, 9], [1, 2, 1, 2, 1, 2], [0, 1, 0, 9, 0, 9]])).tolist() == [
+    assert box_sums(
+        S, np.array([[-9, 9, -9, 9, -9, 9], [1, 2, 1, 2, 1, 2], [0, 1, 0, 9, 0, 9]])
+    ).tolist() == [
         1_000_000,
         1_000_000,
         0,

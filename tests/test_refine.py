@@ -16,7 +16,9 @@ def fitted(cells, peaks, voxel=0.05, subdivision=2, counting=False):
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(("voxel", "subdivision", "counting"), [(0.05, 2, False), (0.05, 1, False), (0.025, 1, True)])
+@pytest.mark.parametrize(
+    ("voxel", "subdivision", "counting"), [(0.05, 2, False), (0.05, 1, False), (0.025, 1, True)]
+)
 def test_equals_the_naive_twin(seed, voxel, subdivision, counting):
     rng = np.random.default_rng(seed)
     centre = rng.uniform(-0.05, 0.05, 3)
@@ -51,7 +53,9 @@ def test_nothing_near_leaves_the_centre_and_the_usual_radius():
 def test_one_part_and_a_part_at_the_very_centre():
     cells = np.zeros((9, 9, 9), np.uint8)
     cells[6, 4, 4] = 1
-    np.testing.assert_allclose(fitted(cells, [[4, 4, 4]]), naive.fit_spheres(cells, [[4, 4, 4]], 0.05, 2), atol=1e-9)
+    np.testing.assert_allclose(
+        fitted(cells, [[4, 4, 4]]), naive.fit_spheres(cells, [[4, 4, 4]], 0.05, 2), atol=1e-9
+    )
     lone = np.zeros((9, 9, 9), np.uint32)
     lone[4, 4, 4] = 5
     assert np.isfinite(fitted(lone, [[4, 4, 4]], 0.05, 1, True)).all()

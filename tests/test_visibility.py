@@ -8,7 +8,9 @@ from headvox.visibility import count_seen
 from headvox.voxelize import Lattice
 
 REGION = scenes.region(0.6, -0.3, 0.5)
-BOXES = np.array([[-1, 2, -1, 2, -1, 2], [0, 1, 0, 1, 0, 1], [-3, -1, 2, 5, 0, 2], [-9, 9, 0, 1, 0, 1]], np.int32)
+BOXES = np.array(
+    [[-1, 2, -1, 2, -1, 2], [0, 1, 0, 1, 0, 1], [-3, -1, 2, 5, 0, 2], [-9, 9, 0, 1, 0, 1]], np.int32
+)
 
 
 def cameras(rng):
@@ -43,7 +45,9 @@ def test_turned_cameras_equal_the_naive_twin():
     lattice = Lattice.over(REGION, 0.05, 2)
     cells = np.column_stack([rng.integers(0, n, 60) for n in lattice.shape]).astype(np.int32)
     seen = count_seen(images, lattice, cells, BOXES)
-    np.testing.assert_array_equal(seen, naive.count_seen(images, naive.lattice_over(REGION, 0.05, 2), cells, BOXES))
+    np.testing.assert_array_equal(
+        seen, naive.count_seen(images, naive.lattice_over(REGION, 0.05, 2), cells, BOXES)
+    )
     assert seen.sum() > 100
 
 
@@ -80,8 +84,12 @@ def test_behind_the_camera_and_beside_the_image_nothing_is_known():
 
 def test_one_camera_that_sees_it_empty_outvotes_all_that_have_it_hidden():
     camera = Intrinsics(20, 20, 10.0, 10.0, 9.5, 9.5)
-    near = DepthImage("near", np.full((20, 20), 300, np.uint16), camera, scenes.looking_along_x(-1.0, 0.0, 0.0))
-    far = DepthImage("far", np.full((20, 20), 3000, np.uint16), camera, scenes.looking_along_x(-1.0, 0.0, 0.0))
+    near = DepthImage(
+        "near", np.full((20, 20), 300, np.uint16), camera, scenes.looking_along_x(-1.0, 0.0, 0.0)
+    )
+    far = DepthImage(
+        "far", np.full((20, 20), 3000, np.uint16), camera, scenes.looking_along_x(-1.0, 0.0, 0.0)
+    )
     lattice = Lattice.over(REGION, 0.05, 1)
     cells = np.array([[12, 12, 6]], np.int32)
     one = BOXES[1:2]

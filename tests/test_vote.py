@@ -65,7 +65,9 @@ def test_votes_of_an_empty_volume_and_of_no_candidate():
 
 
 def test_mirrored_pairs_count_for_the_type_of_the_volume():
-    pairs = max(naive.volume(naive.voxel_box(box, 0.05)) for pair in SMALL_VOTES.votes.mirrored for box in pair)
+    pairs = max(
+        naive.volume(naive.voxel_box(box, 0.05)) for pair in SMALL_VOTES.votes.mirrored for box in pair
+    )
     assert pairs == 12**3
     assert compile_cascade(SMALL_VOTES).largest_sum >= pairs
 
@@ -105,9 +107,15 @@ def random_tree(rng, features, depth):
 @pytest.mark.parametrize("seed", range(4))
 def test_random_trees_equal_the_naive_twin(seed):
     rng = np.random.default_rng(seed)
-    features = [f"near.{s}" for s in ("min", "low", "high", "max", "sum")] + ["core.sum", "unused.low", "free.max"]
+    features = [f"near.{s}" for s in ("min", "low", "high", "max", "sum")] + [
+        "core.sum",
+        "unused.low",
+        "free.max",
+    ]
     stages = tuple(
-        Stage(f"s{k}", float(rng.normal(-2.0)), tuple(random_tree(rng, features[: 6 + k], 5) for _ in range(6)))
+        Stage(
+            f"s{k}", float(rng.normal(-2.0)), tuple(random_tree(rng, features[: 6 + k], 5) for _ in range(6))
+        )
         for k in range(3)
     )
     cascade = replace(SMALL, stages=stages)
@@ -120,7 +128,9 @@ def test_random_trees_equal_the_naive_twin(seed):
     seen = seen.reshape(len(cells), -1, 2)
     S = integral_volume(grid)
     for known, states_known in ((seen, states), (None, None)):
-        wanted = [naive.score_by_stages(naive.weights(grid), cell, cascade, 0.05, states_known) for cell in cells]
+        wanted = [
+            naive.score_by_stages(naive.weights(grid), cell, cascade, 0.05, states_known) for cell in cells
+        ]
         assert score_by_stages(S, cells, compiled.stages, known).tolist() == wanted
 
 

@@ -50,7 +50,11 @@ def test_lattice_equals_the_naive_twin_and_covers_its_region(centre, radius, low
     assert lattice.part_m == twin.part
     np.testing.assert_allclose(lattice.limits(), twin.limits, rtol=1e-5, atol=1e-3)
     for k, (lowest, highest) in enumerate(
-        [(centre[0] - radius, centre[0] + radius), (centre[1] - radius, centre[1] + radius), (low, low + height)]
+        [
+            (centre[0] - radius, centre[0] + radius),
+            (centre[1] - radius, centre[1] + radius),
+            (low, low + height),
+        ]
     ):
         assert lattice.origin[k] <= lowest + 1e-9
         assert lattice.origin[k] + lattice.shape[k] * voxel > highest + 1e-4
@@ -196,9 +200,13 @@ def test_depth_equals_the_naive_twin(seed, voxel, subdivision):
     assert same_grids(DepthImage("d", depth, camera, T), scenes.region(), voxel, subdivision).sum() > 50
 
 
-@pytest.mark.parametrize(("value", "scale", "points"), [(0, 0.001, 0), (500, 0.001, 1), (65535, 0.001, 0), (65535, 1e-5, 1)])
+@pytest.mark.parametrize(
+    ("value", "scale", "points"), [(0, 0.001, 0), (500, 0.001, 1), (65535, 0.001, 0), (65535, 1e-5, 1)]
+)
 def test_one_pixel(value, scale, points):
-    image = DepthImage("d", np.full((1, 1), value, np.uint16), Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0, scale), np.eye(4))
+    image = DepthImage(
+        "d", np.full((1, 1), value, np.uint16), Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0, scale), np.eye(4)
+    )
     assert same_grids(image, Region((0.0, 0.0, 0.0), 0.8, -0.1, 0.8)).sum() == points
 
 

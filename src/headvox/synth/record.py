@@ -132,7 +132,7 @@ def _description(scene: Scene, stamps_ns: Sequence[int]) -> dict[str, Any]:
 
 def _write_png(path: Path, depth: U16) -> None:
     unfinished = path.with_suffix(".part")
-    Image.fromarray(depth).save(unfinished, format="PNG", compress_level=9)
+    Image.fromarray(depth).save(unfinished, format="PNG", compress_level=6)
     os.replace(unfinished, path)
 
 

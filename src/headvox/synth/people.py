@@ -7,7 +7,7 @@ generator gives the same bytes on any number of threads.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -36,6 +36,7 @@ from headvox.synth.wear import SKIN as SKIN
 from headvox.synth.wear import Outfit, Wear, dress, sample_wear
 
 ROUND_DIGITS = 6  # micrometres
+TAKES_OFF_BACKPACK = ("sitting", "lying")
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +135,8 @@ def pose_person(
     ``xy`` is where the middle of the pelvis is, in the world, metres; ``heading_rad`` turns about z, 0 looks
     along x.
     """
+    if person.wear.backpack and pose.posture in TAKES_OFF_BACKPACK:
+        person = replace(person, wear=replace(person.wear, backpack=False))
     body, outfit = _rest(person)
     rotations, positions = pose_skeleton(pose, body.joints)
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)

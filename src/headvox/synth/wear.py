@@ -59,6 +59,7 @@ class Wear:
     mask: bool = False
     headphones: bool = False
     scarf_m: float = 0.0
+    backpack: bool = False
     cloth_m: float = 0.01
     sleeves: float = 1.0
     trousers: float = 1.0
@@ -120,6 +121,7 @@ def sample_wear(rng: np.random.Generator, sex: float, age_years: float) -> Wear:
         mask=bool(rng.random() < 0.06),
         headphones=bool(rng.random() < 0.06) and hat in ("none", "beanie"),
         scarf_m=float(rng.uniform(0.015, 0.04)) if rng.random() < 0.06 else 0.0,
+        backpack=bool(rng.random() < 0.08),
         cloth_m=float(0.005 + 0.035 * rng.beta(1.1, 2.2)),
         sleeves=float(rng.choice((0.15, 0.3, 0.6, 1.0), p=(0.1, 0.3, 0.1, 0.5))),
         trousers=float(rng.choice((0.25, 0.5, 1.0), p=(0.1, 0.15, 0.75))),
@@ -146,6 +148,8 @@ def dress(body: RestBody, wear: Wear) -> Outfit:
         pieces += _headphones(body, head, wear)
     if wear.scarf_m > 0.0:
         pieces.append(_scarf(body, vertices, wear))
+    if wear.backpack:
+        pieces.append(_backpack(body, vertices, wear))
     return _assemble(vertices, materials, pieces, basis.joint("head"), basis.joint("spine01"))
 
 
@@ -182,13 +186,14 @@ def vertex_normals(vertices: F64, faces: I32) -> F64:
     corners = vertices[faces]
     of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], of_face)
+    for axis in range(3):
+        weights = np.repeat(of_face[:, axis], 3)
+        normals[:, axis] = np.bincount(faces.ravel(), weights=weights, minlength=len(vertices))
     lengths = np.sqrt((normals * normals).sum(1, keepdims=True))
     return np.asarray(normals / np.maximum(lengths, 1e-12))
 
 
-def smooth_noise(points: F64, rng: np.random.Generator, wavelength_m: float, waves: int = 8) -> F64:
+def smooth_noise(points: F64, rng: np.random.Generator, wavelength_m: float, waves: int = 6) -> F64:
     """Return smooth noise in about -1..1 at (..., 3) points: a sum of plane waves of random direction."""
     directions = rng.normal(size=(waves, 3))
     directions /= np.sqrt((directions * directions).sum(1, keepdims=True))
@@ -628,3 +633,20 @@ def _scarf(body: RestBody, clothed: F64, wear: Wear) -> Piece:
         path, wear.scarf_m * (1.0 + 0.25 * smooth_noise(path, rng, 0.06)), CLOTH, closed=True, sides=10
     )
     return Piece(ring.vertices, ring.faces, CLOTH, np.full(len(ring.vertices), 0.75))
+
+
+def _backpack(body: RestBody, clothed: F64, wear: Wear) -> Piece:
+    """Put a rounded box on the back, its top near the shoulders."""
+    basis = load_basis()
+    rng = np.random.default_rng([wear.seed, 4])
+    tall = float(np.ptp(body.vertices[:, 2]))
+    half = tall * rng.uniform((0.035, 0.08, 0.11), (0.07, 0.1, 0.15))
+    chest, shoulder = body.joints[basis.joint("spine02")], body.joints[basis.joint("upperarm01.L")]
+    top = shoulder[2] + rng.uniform(-0.03, 0.05) * tall
+    on_back = (np.abs(clothed[:, 1]) < half[1]) & (np.abs(clothed[:, 2] - top + half[2]) < half[2])
+    back = float(np.quantile(clothed[on_back, 0], 0.03))
+    ball = _ball(np.zeros(3), 1.0, CLOTH, rows=11, columns=16)
+    rounded = np.sign(ball.vertices) * np.abs(ball.vertices) ** 0.5  # towards a box
+    vertices = np.array([min(back, chest[0]) - 0.85 * half[0], 0.0, top - half[2]]) + rounded * half
+    vertices = vertices + 0.012 * smooth_noise(vertices, rng, 0.2)[:, None] * rounded
+    return Piece(vertices, ball.faces, CLOTH, np.ones(len(vertices)))

@@ -39,10 +39,10 @@ class Wear:
     """What somebody wears; lengths in metres.
 
     ``hair`` is one of HAIR_STYLES with ``hair_m`` its thickness and ``hair_length_m`` how far it hangs;
-    ``hair_albedo`` from 0 (black) to 1 (white); ``receding`` from 0 to 1 lifts the hairline of the forehead;
-    ``beard_m`` 0 is shaved; ``hat`` is one of HATS, ``hat_m`` its wall and ``hat_turn_rad`` where a visor
-    points; ``cloth_m`` is how far clothes stand off the skin; ``sleeves`` and ``trousers`` run from 0 (short)
-    to 1 (long); ``seed`` draws the noise of hair and cloth.
+    ``hair_albedo`` runs from 0 (black) to 1 (white); ``receding`` from 0 to 1 lifts the hairline of the
+    forehead and ``fringe`` lowers it. ``beard_m`` and ``scarf_m`` are thicknesses, 0 is none. ``hat`` is one
+    of HATS, ``hat_m`` its wall and ``hat_turn_rad`` where a visor points. ``cloth_m`` is how far clothes are
+    off the skin; ``sleeves`` and ``trousers`` run from 0 (short) to 1 (long). ``seed`` draws every noise.
     """
 
     hair: str = "short"

@@ -1,0 +1,49 @@
+import subprocess
+import sys
+
+import pytest
+
+import headvox
+
+HEAVY = ("numba", "scipy", "PIL", "llvmlite", "matplotlib", "rich", "tyro")
+
+
+def loaded_after(code: str) -> set[str]:
+    """Return the top-level packages that a fresh interpreter has loaded after ``code``."""
+    script = f"{code}\nimport sys\nprint(*sorted({{name.partition('.')[0] for name in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    "module", ["headvox", "headvox.data", "headvox.errors", "headvox.config", "headvox.masks"]
+)
+def test_import_waits_for_nothing_heavy(module):
+    assert not loaded_after(f"import {module}") & set(HEAVY)
+
+
+def test_import_alone_loads_no_numpy():
+    assert "numpy" not in loaded_after("import headvox")
+
+
+def test_data_classes_need_no_numba():
+    code = "import headvox\nheadvox.Frame(0); headvox.Heads(); headvox.HeadvoxError('x')"
+    assert not loaded_after(code) & set(HEAVY)
+
+
+def test_public_names_resolve():
+    for name in headvox.__all__:
+        assert getattr(headvox, name) is not None
+    assert set(headvox.__all__) == set(dir(headvox))
+    assert headvox.Detector.__module__ == "headvox.pipeline"
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'headvox' has no attribute 'Detektor'"):
+        headvox.Detektor  # noqa: B018
+
+
+def test_the_version_is_the_packages():
+    from importlib.metadata import version
+
+    assert headvox.__version__ == version("headvox")

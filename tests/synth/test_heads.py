@@ -101,6 +101,14 @@ def test_numbers_below_one_are_refused(tmp_path):
         make_heads(tmp_path, points=0)
 
 
+def test_a_negative_seed_and_a_file_in_the_way_are_refused(tmp_path):
+    with pytest.raises(HeadvoxError, match="seed"):
+        make_heads(tmp_path, seed=-1)
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(HeadvoxError, match="folder"):
+        make_heads(tmp_path / "taken", count=1, points=100)
+
+
 def test_ply_bytes_have_the_size_they_announce():
     data = ply_bytes(np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     assert len(data.split(b"end_header\n", 1)[1]) == 4 * 12 + 2 * 13

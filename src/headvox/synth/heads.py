@@ -40,6 +40,7 @@ LONG = {"head-scale-depth-incr": 0.35, "head-back-scale-depth-incr": 0.2, "head-
 ESCAPE_DIRECTIONS = 96
 ESCAPE_SHARE = 0.06  # of the directions that leave a face must go free, or it lies in a fold
 HEADVOX_TO_PAPER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+MAX_SEED = 2**31 - 1  # of Open3D
 TILE_PX = (150, 180)
 
 
@@ -58,8 +59,8 @@ class Identity:
 class HeadShell:
     """A bald head cut at the neck, in the paper's axes, origin at the head's centre.
 
-    ``vertices`` (V, 3) metres, ``faces`` (F, 3) the outer surface only, ``eyes`` (2, 3) left then right,
-    ``scale`` from the real head to this one.
+    ``vertices`` (V, 3) metres, ``faces`` (F, 3) the outer surface only, ``eyes`` (2, 3) the centres of left
+    and right eyeball, ``scale`` from the real head to this one.
     """
 
     vertices: F64
@@ -137,14 +138,22 @@ def make_heads(
     it was, and any number of ``workers`` writes the same bytes.
 
     Raises:
-        HeadvoxError: a number below one, Open3D missing, or a folder with other heads in it.
+        HeadvoxError: a number below one, a negative seed, Open3D missing, or a folder that cannot be made or
+            that holds other heads.
     """
     for name, value in (("count", count), ("points", points), ("workers", workers)):
         if value < 1:
             raise HeadvoxError(f"Expected {name} to be at least 1, got {value}.", "Give a positive number.")
+    if seed < 0:
+        raise HeadvoxError(f"Expected a seed of 0 or more, got {seed}.", "Give a whole number.")
     _open3d()
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HeadvoxError(
+            f"Cannot make the folder {out}: {error.strerror}.", "Choose another folder."
+        ) from None
     identities = sample_identities(count, seed)
     settings = {"count": count, "points": points, "metric": metric, "seed": seed}
     _claim(out / "settings.json", settings)
@@ -189,7 +198,9 @@ def _write_head(identity: Identity, out: Path, points: int, metric: bool, seed: 
             path.write_bytes(ply_bytes(shell.vertices, shell.faces))
     if not cloud.exists():
         with _replacing(cloud) as path:
-            path.write_bytes(ply_bytes(sample_points(shell, points, seed * 100_003 + identity.number)))
+            path.write_bytes(
+                ply_bytes(sample_points(shell, points, (seed * 100_003 + identity.number) % MAX_SEED))
+            )
     size = np.ptp(shell.vertices, axis=0)
     return {
         **asdict(identity),

@@ -67,7 +67,7 @@ def test_every_cell_that_a_triangle_really_crosses_has_a_point():
             np.floor(dense_even(triangle, count, rng) / 0.02).astype(int), axis=0, return_counts=True
         )
         area = 0.5 * np.linalg.norm(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
-        crossed = cells[hits / count * area > 0.01**2]  # a quarter of a cell's face lies inside it
+        crossed = cells[hits / count * area > 0.5 * 0.02**2]  # half as much as a face of it lies inside
         have = {tuple(c) for c in np.floor(sample_surface(triangle, [[0, 1, 2]]) / 0.02).astype(int)}
         assert len(crossed) > 20
         assert not [cell for cell in map(tuple, crossed) if cell not in have]

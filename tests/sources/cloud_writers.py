@@ -154,7 +154,7 @@ def depth_image(seed: int = 0, width: int = 8, height: int = 6) -> np.ndarray:
 
 def camera(**changes):
     entry = {"width": 8, "height": 6, "fx": 7.0, "fy": 7.5, "cx": 3.5, "cy": 2.5, "depth_scale": 0.001}
-    return {**entry, "T_world_camera": IDENTITY, **changes}
+    return {**entry, "T_world_camera": [list(row) for row in IDENTITY], **changes}
 
 
 def recording(folder: Path, frames: int = 3, **changes) -> dict:

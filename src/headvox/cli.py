@@ -75,7 +75,7 @@ def _dispatch(arguments: list[str]) -> int:
         return int(args.command(args))
     except _UsageError as error:
         args.parser.print_usage(sys.stderr)
-        _complain(str(error), f"See {args.parser.prog} --help.")
+        _complain(f"error: {error}", f"See {args.parser.prog} --help.")
         return USAGE
 
 
@@ -86,12 +86,12 @@ class _UsageError(Exception):
 def _words(error: Exception) -> tuple[str, str]:
     """Return what happened and what to do about it."""
     if isinstance(error, HeadvoxError):
-        return error.what, error.do
+        return f"error: {error.what}", error.do
     if isinstance(error, MemoryError):
-        return "Not enough memory.", "Set a smaller --max-range, or a larger --voxel."
+        return "error: not enough memory.", "Set a smaller --max-range, or a larger --voxel."
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
-        return f"{name}{error.strerror or error}.", ""
+        return f"error: {name}{error.strerror or error}.", ""
     return (
         f"internal error: {type(error).__name__}: {error}",
         "This is a fault of headvox: please report it, with what the same command prints with --debug.",
@@ -100,7 +100,7 @@ def _words(error: Exception) -> tuple[str, str]:
 
 def _complain(what: str, do: str) -> None:
     try:
-        for line in (f"headvox: error: {what}", f"  {do}" if do else ""):
+        for line in (f"headvox: {what}", f"  {do}" if do else ""):
             if line:
                 print(printable(line), file=sys.stderr)
     except BrokenPipeError:
@@ -135,11 +135,15 @@ def _run(args: argparse.Namespace) -> int:
         if args.source is None:
             live.note(f"no SOURCE given: running the sample that ships with headvox, {path}")
         detector = stack.enter_context(closing(Detector(config)))
-        warm_up(config)
-        sinks: list[Sink] = [JsonStream(sys.stdout)] if args.json else []
-        if args.output is not None:
+        sinks: list[Sink] = []
+        if (
+            args.output is not None
+        ):  # before the stream: what was printed is in the file, however the run ends
             _keep_input(args.output, [path, args.config, config.cascade])
             sinks.append(stack.enter_context(closing(open_sink(args.output))))
+        if args.json:
+            sinks.append(JsonStream(sys.stdout))
+        warm_up(config)
         report = run(
             source,
             detector,
@@ -300,12 +304,14 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
     run.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
     _add_settings(run)
+    run.usage = "%(prog)s [SOURCE] [--json] [-o OUT] [flags]"
 
     info = _command(commands, "info", _info, "tell what a source holds")
     info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
 
     config = _command(commands, "config", _show_config, "print the settings as TOML, as --config takes them")
     _add_settings(config)
+    config.usage = "%(prog)s [flags]"
 
     _command(commands, "warmup", _warmup, "compile every loop now, so that no first run has to wait")
     _add_masks(commands)

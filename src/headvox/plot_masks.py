@@ -290,7 +290,7 @@ def _legend(figure: Figure, picture: Picture) -> None:
 
 
 def _extent(picture: Picture) -> tuple[F64, F64]:
-    """Return the lowest and highest corner of what is shown: boxes, and at least head and shoulders."""
+    """Return the lowest and highest corner of what is shown: boxes, at least head and shoulders."""
     low, high = np.array([-0.26, -0.26, -0.36]), np.array([0.26, 0.26, 0.22])
     for painted in picture.boxes:
         centre, half = np.array(painted.box.centre), np.array(painted.box.size) / 2

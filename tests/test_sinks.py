@@ -1,0 +1,120 @@
+"""What is written, to the byte."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from headvox.data import Heads
+from headvox.errors import HeadvoxError
+from headvox.live import Live
+from headvox.run import Report
+from headvox.sinks import Result, open_sink
+from headvox.sinks.jsonl import JsonStream, to_json
+from headvox.table import printable, table
+
+HEADS = Heads(
+    np.array([[1.00004, -2.0, -0.00001]]),
+    np.array([[0.0, 0.0, 0.6, 0.8]]),
+    np.array([0.11]),
+    np.array([3.25]),
+)
+RESULT = Result(7, 123456789012345678, 2.10049, HEADS)
+
+
+def test_a_line_of_json() -> None:
+    assert to_json(RESULT) == (
+        '{"stamp_ns": 123456789012345678, "frame": 7, "latency_ms": 2.1, "heads": [{"id": null, '
+        '"centre": [1.0, -2.0, 0.0], "quaternion": [0.0, 0.0, 0.6, 0.8], "radius": 0.11, "score": 3.25, '
+        '"velocity": null}]}'
+    )
+    assert '"heads": []' in to_json(Result(0, 0, 1.0, Heads()))
+
+
+@given(st.lists(st.floats(), min_size=10, max_size=10))
+def test_no_number_makes_json_that_is_none(values: list[float]) -> None:
+    v = np.array(values)
+    heads = Heads(v[None, :3], v[None, 3:7], v[7:8], v[8:9])
+
+    def refuse(token: str) -> None:
+        raise AssertionError(token)
+
+    line = to_json(Result(0, 0, values[9], heads))
+    json.loads(line, parse_constant=refuse)
+    assert "-0.0," not in line
+
+
+def test_files_are_whole_at_every_moment(tmp_path: Path) -> None:
+    for name in ("out.jsonl", "out.csv"):
+        sink = open_sink(tmp_path / name)
+        for n in range(1, 4):
+            sink.write(RESULT)
+            text = (tmp_path / name).read_text()
+            assert text.endswith("\n")
+            assert len(text.splitlines()) == n + name.endswith("csv")
+        sink.close()
+        sink.close()
+
+
+def test_csv_has_a_row_a_head(tmp_path: Path) -> None:
+    sink = open_sink(tmp_path / "out.csv")
+    sink.write(Result(0, 5, 1.0, Heads()))
+    sink.write(RESULT)
+    sink.close()
+    assert (tmp_path / "out.csv").read_text() == (
+        "frame,stamp_ns,latency_ms,id,x,y,z,qx,qy,qz,qw,radius,score,vx,vy,vz\n"
+        "7,123456789012345678,2.1,,1.0,-2.0,0.0,0.0,0.0,0.6,0.8,0.11,3.25,,,\n"
+    )
+
+
+def test_a_stream_is_not_closed() -> None:
+    stream = io.StringIO()
+    sink = JsonStream(stream)
+    sink.write(RESULT)
+    sink.close()
+    assert stream.getvalue() == to_json(RESULT) + "\n"
+
+
+def test_files_that_cannot_be_written_are_explained(tmp_path: Path) -> None:
+    with pytest.raises(HeadvoxError, match=r"\.jsonl or \.csv"):
+        open_sink(tmp_path / "out.txt")
+    with pytest.raises(HeadvoxError, match="No such file"):
+        open_sink(tmp_path / "nowhere" / "out.csv")
+    full = tmp_path / "full.jsonl"
+    if Path("/dev/full").exists():
+        full.symlink_to("/dev/full")
+        sink = open_sink(full)
+        with pytest.raises(HeadvoxError, match="No space left"):
+            sink.write(RESULT)
+        sink.close()
+
+
+def test_tables_align_and_hide_control_characters() -> None:
+    text = table(["name", "n", "word"], [["a", "1", "x"], ["long\x1b[31m", "20", "yy"]])
+    assert text.splitlines() == ["name        n  word", "a           1  x", "long?[31m  20  yy"]
+    assert printable("a\nb\udc80") == "a?b?"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_live_line_goes_away_for_notes_and_at_the_end() -> None:
+    stream = Terminal()
+    live = Live(stream, None)
+    live.frame(Report(frames=3, bad=1, seconds=0.5))
+    live.frame(Report(frames=4, bad=1, seconds=0.5))  # too soon after the first
+    live.note("frame 2 skipped:\x07 torn")
+    live.close()
+    shown = "frame 3  heads 0  6.0 Hz  0.0 ms  dropped 1"
+    assert stream.getvalue() == f"\r{shown}\r{' ' * len(shown)}\rframe 2 skipped:? torn\n"
+    quiet = io.StringIO()
+    Live(quiet, 9).frame(Report(frames=3))
+    assert quiet.getvalue() == ""

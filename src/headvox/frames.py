@@ -26,10 +26,10 @@ def as_rigid(matrix: npt.ArrayLike, name: str) -> F64:
         raise HeadvoxError(f"{name}: expected a 4x4 matrix, got shape {T.shape}.", "Give four rows of four numbers.")
     if not np.isfinite(T).all():
         raise HeadvoxError(f"{name}: the matrix has NaN or infinite entries.", "An unknown transform is not usable.")
-    if not np.allclose(T[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE):
+    if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > RIGID_TOLERANCE:
         raise HeadvoxError(f"{name}: the last row is {T[3].tolist()}, expected 0 0 0 1.", "Is it transposed?")
     R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=RIGID_TOLERANCE) or np.linalg.det(R) < 0.0:
+    if np.abs(R @ R.T - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(R) < 0.0:
         raise HeadvoxError(
             f"{name}: the rotation part is not a rotation (determinant {np.linalg.det(R):.3g}).",
             "Expected an invertible, unscaled, right-handed rotation.",

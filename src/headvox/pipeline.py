@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,7 @@ class Detector:
         _check_frame(frame)
         clock = _Clock(self.stage_ms)
         memory = self._memory_for(frame)
+        memory.in_use = True
         box = self._voxelize(frame, memory)
         clock.done("voxelize")
         S = self._integrate(memory, box)
@@ -97,6 +99,7 @@ class Detector:
         heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, box, memory)
         clock.done("refine")
         clear(memory.cells[0], box)
+        memory.in_use = False
         return heads
 
     def close(self) -> None:
@@ -132,6 +135,7 @@ class Detector:
             box[:3] = np.minimum(box[:3], other[:3])
             box[3:] = np.maximum(box[3:], other[3:])
         if box[3] < 0:
+            memory.in_use = False
             raise _nothing_in_range(frame, lattice.region)
         box[:3] = np.maximum(box[:3] - memory.reach, 0)
         box[3:] = np.minimum(box[3:] + memory.reach, np.array(shape) - 1)
@@ -241,6 +245,8 @@ class Detector:
     def _memory_for(self, frame: Frame) -> _Memory:
         """Return the working memory, made anew only when the region moved."""
         region = self._region(frame)
+        if self._memory is not None and self._memory.in_use:
+            self._memory = None  # a frame was interrupted midway, and has left something behind
         if self._memory is None or self._memory.lattice.region != region:
             lattice = Lattice.over(region, self.cascade.voxel_m, self.cascade.source.subdivision)
             if self._memory is None or self._memory.lattice.shape != lattice.shape:
@@ -267,7 +273,7 @@ class Detector:
             ):
                 return rays
         rays = Rays.of(image, lattice)
-        self._rays[image.name] = (image, lattice, rays)
+        self._rays[image.name] = (replace(image, T_world_camera=image.T_world_camera.copy()), lattice, rays)
         return rays
 
 
@@ -281,6 +287,7 @@ class _Memory:
         sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
         cells = math.prod(lattice.shape)
         self.lattice = lattice
+        self.in_use = False
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
         self.S = np.empty(math.prod(n + 1 for n in lattice.shape), sum_type)
@@ -341,11 +348,13 @@ def _check_frame(frame: Frame) -> None:
             raise HeadvoxError(f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them.")
         if points.dtype != np.float32 or not points.flags.c_contiguous:
             raise HeadvoxError(
-                f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype}.",
+                f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype} in strides {points.strides}.",
                 "Use np.ascontiguousarray(points, dtype=np.float32).",
             )
         if len(points) == 0:
             raise HeadvoxError(f"{cloud.name}: the cloud is empty.", "Is the sensor running?")
+        if cloud.T_world_sensor is not None:
+            as_rigid(cloud.T_world_sensor, f"{cloud.name}: T_world_sensor")
     for image in frame.depths:
         depth, camera = image.depth, image.intrinsics
         if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
@@ -359,6 +368,7 @@ def _check_frame(frame: Frame) -> None:
             )
         if not (camera.fx > 0 and camera.fy > 0 and camera.depth_scale > 0):
             raise HeadvoxError(f"{image.name}: fx, fy and depth_scale must be above 0.", "Check the intrinsics.")
+        as_rigid(image.T_world_camera, f"{image.name}: T_world_camera")
 
 
 def _nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:

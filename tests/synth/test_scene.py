@@ -7,8 +7,9 @@ import pytest
 from headvox.frames import inverse, transform
 from headvox.synth import mannequin, presets
 from headvox.synth.camera import IDEAL, Lidar, kinect
-from headvox.synth.motion import RATE_HZ, between, live
+from headvox.synth.motion import RATE_HZ, Moment, between, live
 from headvox.synth.people import HAIR
+from headvox.synth.poses import Pose
 from headvox.synth.room import FloorPlan, box, item, sample_room
 from headvox.synth.scene import (
     POSTURES,
@@ -90,9 +91,8 @@ def staged(sensor=IDEAL, hair_albedo=None, wall_at=None, yaw=0.0):
     scene = sample_scene(rng, mannequin, postures=["standing"], moving=False)
     actor = scene.actors[0]
     person = actor.person if hair_albedo is None else replace(actor.person, hair_albedo=hair_albedo)
-    scene.actors = [
-        replace(actor, person=person, moments=[replace(actor.moments[0], xy=(2.5, 0.0), heading_rad=np.pi)])
-    ]
+    moment = Moment(Pose("standing"), (2.5, 0.0), np.pi)
+    scene.actors = [replace(actor, person=person, moments=[moment])]
     scene.room.items = [item("floor", (box((9.0, 9.0, 0.1), (0.0, 0.0, -0.1)), 0.5))]
     scene.room.dummies = []
     if wall_at is not None:

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from headvox.data import F32, F64, U16, Cloud, Intrinsics
 from headvox.frames import transform
-from headvox.synth.rays import NOTHING, Mesh, View, spin
+from headvox.synth.rays import NOTHING, ROOM_ID, Mesh, View, spin
 
 Mask = npt.NDArray[np.bool_]
 Shape = tuple[int, int]
@@ -40,6 +40,7 @@ class Sensor:
     ``salt``         share of the pixels lost for no reason
     ``near_m`` ``far_m``  the range that is delivered
     ``border_px``    columns and rows without return: left, right, top, bottom
+    ``cut_out``      the background was removed: only people are left (ids from 2 on)
     """
 
     name: str
@@ -58,6 +59,7 @@ class Sensor:
     near_m: float = 0.0
     far_m: float = 60.0
     border_px: tuple[int, int, int, int] = (0, 0, 0, 0)
+    cut_out: bool = False
 
 
 IDEAL = Sensor("ideal")
@@ -168,6 +170,8 @@ def measure(
     hole |= ragged_edges(edges, sensor.edge_holes, sensor.hole_px, lasting, rng)
     hole |= salt(perfect.shape, sensor.salt, rng)
     hole |= border(perfect.shape, sensor.border_px)
+    if sensor.cut_out:
+        hole |= view.ids <= ROOM_ID
     if sensor.shadow:
         hole |= shadow(perfect, sensor.baseline_m < 0.0)
     disparity = fattened(perfect, sensor.fatten_px)

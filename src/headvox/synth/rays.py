@@ -21,6 +21,7 @@ I32 = npt.NDArray[np.int32]
 
 NEAR_M = 0.02
 NOTHING = -1
+ROOM_ID = 0  # walls and furniture; people have larger ids
 
 
 @dataclass(frozen=True, slots=True)

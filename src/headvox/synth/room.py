@@ -13,12 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.data import F32, F64
-from headvox.synth.rays import I32, Mesh, join
+from headvox.synth.rays import I32, ROOM_ID, Mesh, join
 
 Rng = np.random.Generator
 Solid = tuple[F64, I32]
 
-ROOM_ID = 0
 CELL_M = 0.05
 
 

@@ -298,16 +298,25 @@ def lens(kind: str, rng: Rng | None = None) -> Intrinsics:
 
 
 def sample_device(rng: Rng) -> tuple[Intrinsics, Sensor]:
-    """A camera off the shelf, from clean to terrible."""
+    """A camera off the shelf, from clean to terrible; behind one in thirty the background is cut away."""
     kind = str(rng.choice(["kinect", "d435i", "d435i-vga", "d435i-small"], p=[0.45, 0.2, 0.2, 0.15]))
-    return lens(kind, rng), (kinect(rng) if kind == "kinect" else d435i(rng))
+    sensor = kinect(rng) if kind == "kinect" else d435i(rng)
+    return lens(kind, rng), replace(sensor, cut_out=bool(rng.uniform() < 1.0 / 30.0))
 
 
 def sample_camera_pose(rng: Rng, room: Room, targets: F64, intrinsics: Intrinsics) -> F64:
     """A place that a robot, a tripod, a shelf or a wall offers; most see some of ``targets`` (N, 3)."""
     tries = 1 if len(targets) == 0 or rng.uniform() < 0.15 else 4
-    poses = [_camera_somewhere(rng, room, targets) for _ in range(tries)]
-    return max(poses, key=lambda pose: _in_view(targets, intrinsics, pose))
+    poses = [_camera_somewhere(rng, room, targets) for _ in range(tries + 2)]
+    mesh = room.mesh()
+    clear = [pose for pose in poses if _is_clear(mesh, pose)]
+    return max((clear or poses)[:tries], key=lambda pose: _in_view(targets, intrinsics, pose))
+
+
+def _is_clear(mesh: Mesh, T_world_camera: F64) -> bool:
+    """Whether the camera is neither in a thing nor right in front of one, seen through a coarse lens."""
+    view = look(mesh, Intrinsics(32, 24, 20.0, 20.0, 15.5, 11.5), T_world_camera)
+    return bool((view.distance_m < 0.4).mean() < 0.2)
 
 
 def _in_view(targets: F64, intrinsics: Intrinsics, T_world_camera: F64) -> int:
@@ -367,10 +376,12 @@ def place_person(
     number: int,
     posture: str,
     reach_m: tuple[float, float] | None = None,
+    beside: tuple[float, float] | None = None,
 ) -> Actor | None:
     """Put a person with what they sit or lie on where there is space; None when the room is too full.
 
-    ``reach_m`` keeps them within so many metres of the room's middle, along x and y.
+    ``reach_m`` keeps them within so many metres of the room's middle, along x and y; ``beside`` looks near a
+    place first.
     """
     person = people.sample_person(rng)
     reach_m = (0.47 * room.x_m, 0.47 * room.y_m) if reach_m is None else reach_m
@@ -381,8 +392,11 @@ def place_person(
     if posture == "lying" and furniture:
         lift = 0.98 * float(furniture[0][0].vertices[:8, 2].max())
     ground = body.vertices[:: max(1, len(body.vertices) // 400), :2]
-    for _ in range(25):
-        x, y = (float(n) for n in rng.uniform(-1.0, 1.0, 2) * reach_m)
+    for attempt in range(25):
+        at = rng.uniform(-1.0, 1.0, 2) * reach_m
+        if beside is not None and attempt < 12:
+            at = np.array(beside) + rng.normal(0.0, 0.5, 2)
+        x, y = (float(n) for n in at)
         yaw = float(rng.uniform(-np.pi, np.pi))
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, s], [-s, c]])
@@ -465,8 +479,10 @@ def sample_scene(
         count = 0 if rng.uniform() < 0.25 else int(rng.choice([1, 2, 3, 4, 5], p=[0.3, 0.27, 0.2, 0.13, 0.1]))
         postures = [str(name) for name in rng.choice(POSTURES, count, p=POSTURE_SHARES)]
     actors: list[Actor] = []
+    is_group = rng.uniform() < 0.4
     for posture in postures:
-        actor = place_person(rng, people, room, len(actors) + 1, posture)
+        beside = actors[-1].moments[0].xy if is_group and actors else None
+        actor = place_person(rng, people, room, len(actors) + 1, posture, beside=beside)
         if actor is not None:
             actors.append(actor)
     if rng.uniform() < 0.1:

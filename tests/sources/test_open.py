@@ -159,9 +159,14 @@ def test_check_cloud_refuses_in_one_line(points, message):
     assert error.value.do
 
 
-def test_as_points_never_changes_its_input():
-    values = np.array([[1.0, np.inf, 3.0]], np.float32)
-    assert np.isnan(as_points(values, "a")).all()
-    assert values.tolist() == [[1.0, np.inf, 3.0]]
-    with pytest.raises(HeadvoxError, match="expected points as"):
-        as_points(np.zeros((2, 3), bool), "a")
+def test_points_that_are_not_finite_are_nan_as_a_whole_and_the_input_stays():
+    x, y, z = np.array([[1.0, 1.0, 1e300], [2.0, np.inf, 2.0], [3.0, 3.0, 3.0]])
+    points = as_points(x, y, z)
+    np.testing.assert_array_equal(points, [[1, 2, 3], [np.nan] * 3, [np.nan] * 3])
+    assert points.dtype == np.float32
+    assert np.isinf(y[1])
+
+
+def test_a_signalling_nan_is_a_nan():
+    x = np.array([0x7FF4 << 48, 0], np.uint64).view(np.float64)
+    assert np.isnan(as_points(x, np.zeros(2), np.zeros(2))).all(axis=1).tolist() == [True, False]

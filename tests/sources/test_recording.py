@@ -196,6 +196,7 @@ LEFT = ("cameras", "left")
         (put([*LEFT, "fx"], 10**400), "fx: expected a finite number, got a huge number"),
         (put([*LEFT, "fx"], 0), "fx is 0.0, expected more than 0"),
         (put([*LEFT, "depth_scale"], -0.001), "depth_scale is -0.001"),
+        (put([*LEFT, "depth_scale"], 1), "depth_scale is 1, expected 0.000001 to 0.1"),
         (put([*LEFT, "width"], 8.0), "width: expected a whole number, got 8.0"),
         (put([*LEFT, "width"], True), "width: expected a whole number, got True"),
         (put([*LEFT, "height"], 0), "the size is 8x0"),

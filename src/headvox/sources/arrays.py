@@ -6,6 +6,7 @@ import io
 import math
 import warnings
 import zipfile
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -114,25 +115,25 @@ def _cloud(kind: str, values: Values, name: str) -> CloudFile:
     else:
         xyz = _columns(values, name)
         extra = tuple(f"column {i}" for i in range(3, values.shape[-1]))
-    points = as_points(xyz, name)
+    points = as_points(*xyz)
     return CloudFile(f"{kind}, {values.dtype.name}", points, vertices=len(points), extra=extra)
 
 
-def _fields(values: Values, name: str) -> Values:
+def _fields(values: Values, name: str) -> Iterable[Values]:
     names = values.dtype.names or ()
     if not {"x", "y", "z"} <= set(names) or any(values.dtype[axis].shape for axis in "xyz"):
         raise HeadvoxError(f"{name}: expected the fields x, y, z, got {', '.join(names)[:80]}.", _SAVE_AS)
     if any(values.dtype[axis].kind not in "fiu" for axis in "xyz"):
         raise HeadvoxError(f"{name}: expected x, y, z as numbers, got {values.dtype['x']}.", _SAVE_AS)
-    return np.stack([values[axis].reshape(-1) for axis in "xyz"], axis=1)
+    return (values[axis].reshape(-1) for axis in "xyz")
 
 
-def _columns(values: Values, name: str) -> Values:
+def _columns(values: Values, name: str) -> Iterable[Values]:
     if values.dtype.kind != "f":
         raise HeadvoxError(f"{name}: expected float32 or float64 points, got {values.dtype}.", _SAVE_AS)
     if values.ndim not in (2, 3) or not 3 <= values.shape[-1] <= _MAX_COLUMNS:
         raise HeadvoxError(f"{name}: expected shape (N, 3) or (H, W, 3), got {values.shape}.", _SAVE_AS)
-    return values.reshape(-1, values.shape[-1])[:, :3]
+    return values.reshape(-1, values.shape[-1])[:, :3].T
 
 
 def _one_line(error: Exception) -> str:

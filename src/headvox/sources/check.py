@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 from headvox.data import F32, F64
 from headvox.errors import HeadvoxError
 
+Column = npt.NDArray[Any]
+
 FARTHEST_MEDIAN_M = 100.0  # no indoor sensor sees its typical point from farther away
 _SAMPLE = 10_000  # points that are looked at: every frame passes here
 
 
-def as_points(values: npt.NDArray[np.generic], name: str) -> F32:
-    """Return (N, 3) numbers as a point array: float32, C-contiguous, a point that is not finite all NaN.
+def as_points(x: Column, y: Column, z: Column) -> F32:
+    """Return three columns (N,) of real numbers, metres, as a point array.
 
-    Args:
-        values: (N, 3), any real numbers, metres; it is not changed.
-        name: what the cloud is called in an error.
-
-    Raises:
-        HeadvoxError: another shape, or entries that are not real numbers.
+    Returns:
+        (N, 3) float32, C-contiguous, metres in the frame of the columns; a point with a coordinate that is
+        not finite is NaN in all of them.
     """
-    if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
-        raise HeadvoxError(
-            f"{name}: expected points as (N, 3) numbers, got shape {values.shape} of {values.dtype}.",
-            "Give x, y, z in metres.",
-        )
-    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes inf and then NaN
-        points = np.array(values, dtype=np.float32, order="C")
-        finite = np.isfinite(points.sum(axis=1, dtype=np.float64))
+    points = np.empty((len(x), 3), dtype=np.float32)
+    # What float32 cannot hold becomes infinite and then NaN; a signalling NaN is a NaN like any other.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis, column in enumerate((x, y, z)):
+            points[:, axis] = column
+    finite = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
     if not finite.all():
         points[~finite] = np.nan
     return points

@@ -7,13 +7,12 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from headvox.data import F64
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.sources import lzf
-from headvox.sources.check import as_points
+from headvox.sources.check import Column, as_points
 from headvox.sources.cloudfile import CloudFile
 from headvox.sources.text import parse_numbers
 
@@ -21,8 +20,6 @@ _MAX_HEADER_BYTES = 1 << 16
 _MAX_POINT_BYTES = 1 << 20
 _TYPES = {("F", 4), ("F", 8), *((kind, size) for kind in "IU" for size in (1, 2, 4, 8))}
 _DAMAGED = "The file is damaged or not complete."
-
-Values = npt.NDArray[np.generic]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +66,8 @@ def read_pcd(data: bytes, name: str) -> CloudFile:
     header = _header(data, name)
     body = memoryview(data)[header.body_start :]
     read = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.encoding]
-    points = as_points(read(body, header, name) if header.points else np.empty((0, 3)), name)
+    columns = read(body, header, name) if header.points else dict.fromkeys("xyz", np.empty(0))
+    points = as_points(*(columns[axis] for axis in "xyz"))
     return CloudFile(
         format=f"pcd, {header.encoding.replace('_', ' ')}",
         points=points,
@@ -183,35 +181,35 @@ def _viewpoint(entries: dict[str, list[str]], name: str) -> F64 | None:
     return None if np.array_equal(T_world_sensor, np.eye(4)) else T_world_sensor
 
 
-def _ascii(body: memoryview, header: Header, name: str) -> Values:
+def _ascii(body: memoryview, header: Header, name: str) -> dict[str, Column]:
     numbers = parse_numbers(bytes(body), name)
     width = sum(f.count for f in header.fields)
     if len(numbers) < header.points * width:
         raise _truncated(header, len(numbers) // width, name)
     table = numbers[: header.points * width].reshape(header.points, width)
-    columns = {}
+    columns: dict[str, Column] = {}
     at = 0
     for f in header.fields:
-        columns[f.name] = at
+        columns[f.name] = table[:, at]
         at += f.count
-    return table[:, [columns[axis] for axis in "xyz"]]
+    return columns
 
 
-def _binary(body: memoryview, header: Header, name: str) -> Values:
+def _binary(body: memoryview, header: Header, name: str) -> dict[str, Column]:
     """Points one after the other."""
     stride = sum(f.size for f in header.fields)
     if len(body) < header.points * stride:
         raise _truncated(header, len(body) // stride, name)
-    columns: dict[str, Values] = {}
+    columns: dict[str, Column] = {}
     at = 0
     for f in header.fields:
         if f.name in ("x", "y", "z"):
             columns[f.name] = np.ndarray((header.points,), f.dtype, body, at, (stride,))
         at += f.size
-    return np.stack([columns[axis] for axis in "xyz"], axis=1)
+    return columns
 
 
-def _compressed(body: memoryview, header: Header, name: str) -> Values:
+def _compressed(body: memoryview, header: Header, name: str) -> dict[str, Column]:
     """Fields one after the other, all of them packed."""
     fields = [f for f in header.fields if f.name != "_"]  # the library leaves the padding out
     size = header.points * sum(f.size for f in fields)
@@ -228,13 +226,13 @@ def _compressed(body: memoryview, header: Header, name: str) -> Values:
         unpacked = lzf.decompress(bytes(body[8 : 8 + packed_size]), size)
     except ValueError as error:
         raise HeadvoxError(f"{name}: the compressed points are damaged: {error}.", _DAMAGED) from None
-    columns: dict[str, Values] = {}
+    columns: dict[str, Column] = {}
     at = 0
     for f in fields:
         if f.name in ("x", "y", "z"):
             columns[f.name] = np.frombuffer(unpacked, f.dtype, header.points, at)
         at += header.points * f.size
-    return np.stack([columns[axis] for axis in "xyz"], axis=1)
+    return columns
 
 
 def _truncated(header: Header, points: int, name: str) -> HeadvoxError:

@@ -7,7 +7,6 @@ import struct
 from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from headvox.data import I64
 from headvox.errors import HeadvoxError
 from headvox.mesh import sample_surface, triangulate
-from headvox.sources.check import as_points, check_cloud
+from headvox.sources.check import Column, as_points, check_cloud
 from headvox.sources.cloudfile import CloudFile
 from headvox.sources.text import parse_numbers
 
@@ -31,7 +30,6 @@ _MAX_HEADER_BYTES = 1 << 20
 _DAMAGED = "The file is damaged or not complete."
 
 Bytes = npt.NDArray[np.uint8]
-Column = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +91,7 @@ def read_ply(data: bytes, name: str) -> CloudFile:
     tables = _tables(body, elements, name)
 
     vertex, face = tables["vertex"], tables.get("face")
-    vertices = as_points(np.stack([_scalars(body, vertex, axis, name) for axis in "xyz"], axis=1), name)
+    vertices = as_points(*(_scalars(body, vertex, axis, name) for axis in "xyz"))
     check_cloud(vertices, name)  # before a surface in millimetres fills the memory
     triangles = triangulate(_polygons(body, face) if face else ())
     return CloudFile(

@@ -203,11 +203,14 @@ def _camera(entry: Any, name: str) -> Camera:
     fx, fy, cx, cy, scale = (
         _number(_get(camera, key, name), f"{name}: {key}") for key in ("fx", "fy", "cx", "cy", "depth_scale")
     )
-    for key, value in (("fx", fx), ("fy", fy), ("depth_scale", scale)):
+    for key, value in (("fx", fx), ("fy", fy)):
         if not value > 0.0:
-            raise HeadvoxError(
-                f"{name}: {key} is {value}, expected more than 0.", "Give pixels, metres per unit."
-            )
+            raise HeadvoxError(f"{name}: {key} is {value}, expected more than 0.", "Give it in pixels.")
+    if not 1e-6 <= scale <= 0.1:
+        raise HeadvoxError(
+            f"{name}: depth_scale is {scale:g}, expected 0.000001 to 0.1 metres a unit.",
+            "It is 0.001 for an image in millimetres.",
+        )
     pose = camera.get("T_world_camera")
     return Camera(
         Intrinsics(width, height, fx, fy, cx, cy, scale),

@@ -355,16 +355,12 @@ def count_seen(images, lattice: Lattice, cells, boxes) -> np.ndarray:
 
 def suppress(cells: np.ndarray, scores: np.ndarray, least: int) -> np.ndarray:
     """Return the candidates that beat every neighbour; of equal neighbours the first wins."""
+    number = {tuple(cell): i for i, cell in enumerate(cells.tolist())}
     peaks = []
-    for i in range(len(cells)):
-        beaten = scores[i] < least
-        for j in range(len(cells)):
-            neighbours = (
-                i != j and max(abs(int(a) - int(b)) for a, b in zip(cells[i], cells[j], strict=True)) <= 1
-            )
-            if neighbours and (scores[j] > scores[i] or (scores[j] == scores[i] and j < i)):
-                beaten = True
-        if not beaten:
+    for (x, y, z), i in number.items():
+        around = [(x + a, y + b, z + c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)]
+        others = [number[cell] for cell in around if cell in number and cell != (x, y, z)]
+        if scores[i] >= least and all((scores[i], -i) > (scores[j], -j) for j in others):
             peaks.append(i)
     return np.array(peaks, np.int64)
 

@@ -41,12 +41,12 @@ def digest(frame, heads):
 
 def test_true_heads_project_to_their_pixels_and_lie_just_behind_the_surface():
     checked = 0
-    for seed in range(25):
+    for seed in range(40):
         frame, heads = ideal(sample_scene(np.random.default_rng(seed), mannequin, moving=False)).frame(0)
         for depth in frame.depths:
             lens_ = depth.intrinsics
             for head in heads:
-                if head.posture == "mannequin" or head.truncated or head.visible[depth.name] < 0.95:
+                if head.posture == "mannequin" or head.truncated or head.visible[depth.name] < 0.9:
                     continue
                 x, y, z = transform(inverse(depth.T_world_camera), head.centre[None])[0]
                 u, v = round(lens_.fx * x / z + lens_.cx), round(lens_.fy * y / z + lens_.cy)
@@ -91,7 +91,7 @@ def staged(sensor=IDEAL, hair_albedo=None, wall_at=None, yaw=0.0):
     scene = sample_scene(rng, mannequin, postures=["standing"], moving=False)
     actor = scene.actors[0]
     person = actor.person if hair_albedo is None else replace(actor.person, hair_albedo=hair_albedo)
-    moment = Moment(Pose("standing"), (2.5, 0.0), np.pi)
+    moment = Moment(Pose("standing"), (2.5, 0.0), 0.0)  # seen from behind
     scene.actors = [replace(actor, person=person, moments=[moment])]
     scene.room.items = [item("floor", (box((9.0, 9.0, 0.1), (0.0, 0.0, -0.1)), 0.5))]
     scene.room.dummies = []
@@ -103,7 +103,7 @@ def staged(sensor=IDEAL, hair_albedo=None, wall_at=None, yaw=0.0):
 
 def test_a_head_in_plain_sight_is_visible_and_one_behind_a_wall_is_ignored():
     (head,) = staged().frame(0)[1]
-    assert head.visible["front"] == pytest.approx(1.0, abs=0.02)
+    assert head.visible["front"] > 0.9
     assert not head.ignore
     assert not head.truncated
     (hidden,) = staged(wall_at=1.5).frame(0)[1]

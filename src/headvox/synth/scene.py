@@ -42,7 +42,7 @@ from headvox.synth.room import (
 Rng = np.random.Generator
 
 HEAD_REACH_M = 0.155  # faces within this of the head's centre, and not below the chin, are the head's
-CHIN_M = 0.125
+CHIN_M = 0.11
 LEAST_VISIBLE = 0.15
 UPRIGHT = ("standing", "walking", "sitting")
 POSTURES = (*UPRIGHT, "bending", "crouching", "lying", "arms_raised")

@@ -48,6 +48,16 @@ def test_rows_alike_and_rows_of_different_length_read_the_same():
     np.testing.assert_array_equal(alike, mixed)
 
 
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_faces_without_corners_are_passed_over(encoding):
+    plain = read_ply(ply(SQUARE, encoding, [(0, 1, 2)]), "a.ply")
+    for faces in ([(0, 1, 2), ()], [(), (0, 1, 2)], [(0, 1, 2), (4,), ()]):
+        cloud = read_ply(ply(SQUARE, encoding, faces), "a.ply")
+        assert cloud.faces == len(faces)
+        np.testing.assert_array_equal(cloud.points, plain.points)
+    np.testing.assert_array_equal(read_ply(ply(SQUARE, encoding, [()]), "a.ply").points, SQUARE)
+
+
 def test_elements_before_and_after_are_passed_over():
     before = b"ply\nformat ascii 1.0\nelement camera 2\nproperty list uchar float view\nelement vertex 1\n"
     before += (

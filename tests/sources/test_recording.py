@@ -251,7 +251,7 @@ def test_a_bad_recording_json_is_refused_in_one_line(tmp_path, change, message):
         (b"", "not valid JSON"),
         (b'{"format": ', "not valid JSON"),
         (b"\xff\xfe\x00", "not valid JSON"),
-        (b'{"version": ' + b"9" * 10_000 + b"}", "not valid JSON"),
+        (b'{"version": ' + b"9" * 10_000 + b"}", "not valid JSON|key 'format' is missing"),
         (b"[" * 1_000_000, "nested too deeply|not valid JSON"),
         (b'{"a":' * 1_000_000, "nested too deeply|not valid JSON"),
         (b"[]", "expected an object in braces, got a list of 0"),

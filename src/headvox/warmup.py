@@ -10,25 +10,26 @@ import numpy as np
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Frame, Intrinsics
 from headvox.gate import gate_columns
-from headvox.masks import CompiledCascade
+from headvox.masks import CompiledCascade, load_cascade
 from headvox.pipeline import Detector
 
 _ANYTHING = 1 << 40
 
 
 def warm_up(config: DetectorConfig) -> None:
-    """Run a detector as ``config`` asks for, over a hand-sized cloud and a depth image of a few pixels.
+    """Run a detector as ``config`` asks for, over a few voxels of points and a depth image of a few pixels.
 
     Raises:
         HeadvoxError: no such cascade.
     """
-    near = replace(config, centre=(0.0, 0.0, 0.0), max_range_m=0.5, min_height_m=-0.5, max_height_m=0.5)
-    detector = Detector(replace(near, min_score=-1e6))
+    voxel = config.voxel_m or load_cascade(config.cascade).voxel_m
+    near = replace(config, max_range_m=6 * voxel, min_height_m=-6 * voxel, max_height_m=6 * voxel)
+    detector = Detector(replace(near, centre=(0.0, 0.0, 0.0), min_score=-1e6))
     detector.cascade = _open(detector.cascade)
-    grid = np.arange(-0.1, 0.1, 0.02, dtype=np.float32)
-    points = np.ascontiguousarray(np.stack(np.meshgrid(grid, grid, grid), axis=-1).reshape(-1, 3))
-    wall = np.full((12, 16), 200, np.uint16)
-    camera = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0)
+    grid = voxel * np.linspace(-2, 2, 9, dtype=np.float32)
+    points = np.stack(np.meshgrid(grid, grid, grid), axis=-1).reshape(-1, 3).astype(np.float32)
+    wall = np.full((12, 16), 3, np.uint16)
+    camera = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0, depth_scale=voxel)
     for writeable in (
         True,
         False,

@@ -1,0 +1,75 @@
+"""Warming up compiles all that later frames need."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from headvox.config import DetectorConfig
+from headvox.data import Cloud, DepthImage, Frame, Intrinsics
+from headvox.errors import HeadvoxError
+from headvox.masks import shipped_cascades
+from headvox.pipeline import Detector
+from headvox.warmup import cache_folder, warm_up
+
+
+def compiled() -> dict[str, int]:
+    """How many versions of each kernel there are in this process."""
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith("headvox.")]
+    kernels = {
+        k.py_func.__qualname__: k for m in modules for k in vars(m).values() if isinstance(k, Dispatcher)
+    }
+    return {name: len(kernel.signatures) for name, kernel in kernels.items()}
+
+
+def frames() -> list[Frame]:
+    """A ball and a wall, as points and as depth images, in memory of one's own and in somebody else's."""
+    rng = np.random.default_rng(1)
+    ball = rng.normal(size=(4000, 3))
+    ball *= 0.1 / np.linalg.norm(ball, axis=1, keepdims=True)
+    points = np.ascontiguousarray(ball + np.array([1.0, 0.0, 1.5]), dtype=np.float32)
+    depth = np.full((60, 80), 2000, np.uint16)
+    depth[20:40, 30:50] = 1500
+    camera = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
+    T = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1.0]])
+    made = []
+    for writeable in (True, False):
+        points, depth = points.copy(), depth.copy()
+        points.flags.writeable = depth.flags.writeable = writeable
+        made.append(Frame(0, clouds=(Cloud("ball", points),)))
+        made.append(
+            Frame(0, depths=(DepthImage("left", depth, camera, T), DepthImage("right", depth, camera, T)))
+        )
+    return made
+
+
+@pytest.mark.parametrize("cascade", shipped_cascades())
+@pytest.mark.parametrize("threads", [1, 2])
+def test_no_frame_compiles_anything_after_a_warm_up(cascade: str, threads: int) -> None:
+    config = DetectorConfig(cascade=cascade, threads=threads, min_score=-1000.0)
+    warm_up(config)
+    before = compiled()
+    detector = Detector(config)
+    for frame in frames():
+        detector.detect_frame(frame)
+    detector.close()
+    assert compiled() == before
+    assert sum(before.values()) > 10
+
+
+@pytest.mark.parametrize("voxel_m", [0.005, 0.2])
+def test_any_voxel_size_is_quick_to_warm_up(voxel_m: float) -> None:
+    warm_up(DetectorConfig(voxel_m=voxel_m))
+
+
+def test_an_unknown_cascade_is_told() -> None:
+    with pytest.raises(HeadvoxError, match="nonesuch"):
+        warm_up(DetectorConfig(cascade="nonesuch"))
+
+
+def test_the_cache_is_a_folder() -> None:
+    warm_up(DetectorConfig())
+    assert cache_folder().is_dir()

@@ -305,11 +305,12 @@ class _Memory:
             self.offsets, self.offset_start = cells_of(boxes)
             self.tables = stage_tables(cascade.stages, seen_start)
             self.features = [np.zeros(feature_count(cascade.stages), np.int64) for _ in range(threads)]
+        self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 
     def make_room(self, candidates: int) -> None:
         """Have room for as many candidates."""
-        if not hasattr(self, "scores") or len(self.scores) < candidates:
+        if len(self.scores) < candidates:
             self.scores = np.empty(2 * candidates, np.int64)
             self.yaws = np.zeros(2 * candidates, np.int32)
             self.peaks = np.empty(2 * candidates, np.int64)

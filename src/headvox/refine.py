@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.data import F64
-from headvox.integral import PARTS
 from headvox.kernels import kernel, rule
 
 REACH_M = 0.16

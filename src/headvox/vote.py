@@ -138,7 +138,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
             for t in range(stage_trees[s], stage_trees[s + 1]):
                 score += leaf[_descend(root[t], features, feature, cut, left, right)]
             if score < stage_keep[s]:
-                score = DROPPED
+                score = np.int64(DROPPED)
                 break
         scores[i] = score
 
@@ -146,7 +146,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
 def seen_boxes(stages: CompiledStages) -> tuple[I32, I32]:
     """Return the boxes (B, 6) that look at the channels "empty" and "hidden", and where each group's begin (G,)."""
     start = np.zeros(len(stages.group_channel), np.int32)
-    boxes = []
+    boxes: list[I32] = []
     for g, channel in enumerate(stages.group_channel):
         if channel:
             start[g] = len(boxes)

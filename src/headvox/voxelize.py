@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F32, U16, Cloud, DepthImage
+from headvox.data import F32, F64, U16, Cloud, DepthImage
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
 from headvox.kernels import kernel
@@ -84,9 +84,10 @@ class Lattice:
             dtype=np.float32,
         )
 
-    def centres(self, cells: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    def centres(self, cells: npt.NDArray[Any]) -> F64:
         """Return the world centres (N, 3) of ``cells`` (N, 3)."""
-        return (np.asarray(cells, dtype=np.float64) + 0.5) * self.voxel_m + np.array(self.origin)
+        centres: F64 = (np.asarray(cells, dtype=np.float64) + 0.5) * self.voxel_m + np.array(self.origin)
+        return centres
 
 
 def new_box() -> npt.NDArray[np.int64]:
@@ -267,7 +268,7 @@ def part_transform(cloud: Cloud, lattice: Lattice) -> F32:
 
 def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cells:
     """Return the grid of one cloud: uint8 parts, or uint32 points a voxel with ``count``; shape as the lattice."""
-    cells = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
+    cells: npt.NDArray[Any] = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
     mark_points(
         cloud.points,
         part_transform(cloud, lattice),
@@ -283,7 +284,7 @@ def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cell
 
 def voxelize_depth(image: DepthImage, lattice: Lattice, count: bool = False) -> Cells:
     """Return the grid of one depth image, without making a cloud; else as :func:`voxelize_points`."""
-    cells = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
+    cells: npt.NDArray[Any] = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
     rays = Rays.of(image, lattice)
     depth: U16 = image.depth
     mark_depth(

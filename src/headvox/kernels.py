@@ -7,24 +7,40 @@ whatever the number of threads, and integer results make the split invisible in 
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any
 
 import numba
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+
+def _source_stamp() -> tuple[str, int]:
+    """Return a stamp that changes when any file of the package does."""
+    check = 0
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        check = zlib.crc32(path.read_bytes(), check)
+    return ("headvox", check)
 
 
-def kernel(function: Function) -> Function:
+STAMP = _source_stamp()
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function``: cached, without the GIL, IEEE arithmetic (no contraction, no reordering)."""
-    compiled: Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    # Numba's cache looks at the date of the kernel's own file only: it would run on with an old rule when a rule of
+    # another file is edited, or when a new version is installed with equal dates.
+    cache_file = getattr(compiled._cache, "_cache_file", None)
+    if cache_file is not None:
+        cache_file._source_stamp = STAMP
+    return compiled  # type: ignore[no-any-return]
 
 
-def rule(function: Function) -> Function:
+def rule(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a scalar rule that kernels of the same file inline."""
-    compiled: Function = numba.njit(inline="always", error_model="numpy")(function)
+    compiled: Callable[..., Any] = numba.njit(inline="always", error_model="numpy")(function)
     return compiled
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import signal
 import subprocess
 import sys
@@ -168,6 +167,7 @@ def test_a_single_frame_shows_its_heads(recording: Path, anything: Path) -> None
 
 
 def test_a_terminal_gets_one_live_line(recording: Path) -> None:
+    pty = pytest.importorskip("pty")
     master, slave = pty.openpty()
     command = [str(COMMAND), "run", str(recording), "--json"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=slave) as process:
@@ -264,7 +264,12 @@ def test_ctrl_c_ends_with_130_and_whole_lines(tmp_path: Path) -> None:
 def test_a_closed_pipe_ends_quietly(recording: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    for arguments in (["run", str(recording), "--json"], ["masks", "list"], ["info", str(recording)]):
+    for arguments in (
+        ["run", str(recording), "--json"],
+        ["info", str(recording)],
+        ["masks", "list"],
+        ["--help"],
+    ):
         done = subprocess.run(
             [str(COMMAND), *arguments], stdout=writing, stderr=subprocess.PIPE, check=False, timeout=300
         )

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 GOOD, KNOWN_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
 
-# Commands that read their own flags: `headvox NAME ...` is MODULE.main([...]).
-MODULES = {"bench": "headvox.bench"}
+# Commands that read their own flags: `headvox NAME ...` is main([...]) of a module, which returns the code.
+MODULES = {"bench": ("headvox.bench", "measure how fast it is here")}
 
 DESCRIPTION = (
     "Find human heads in 3-D, in real time, in point clouds and depth images, without a neural network."
@@ -67,10 +67,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _dispatch(arguments: list[str]) -> int:
     if arguments and arguments[0] in MODULES:
-        module = importlib.import_module(MODULES[arguments[0]])
+        module = importlib.import_module(MODULES[arguments[0]][0])
         return int(module.main([argument for argument in arguments[1:] if argument != "--debug"]) or GOOD)
     parser = _parser()
-    args = parser.parse_args(arguments)
+    try:
+        args = parser.parse_args(arguments)
+    except SystemExit as done:  # after --help, --version or wrong usage
+        return int(done.code or GOOD)
     try:
         return int(args.command(args))
     except _UsageError as error:
@@ -223,7 +226,7 @@ def _masks_plot(args: argparse.Namespace) -> int:
     cascade = load_cascade(args.cascade)
     folder = args.output or Path(f"masks-{file_name(cascade.name)}")
     for path in plot_cascade(cascade, folder):
-        print(path, flush=True)
+        print(printable(str(path)), flush=True)
     return GOOD
 
 
@@ -315,8 +318,8 @@ def _parser() -> argparse.ArgumentParser:
 
     _command(commands, "warmup", _warmup, "compile every loop now, so that no first run has to wait")
     _add_masks(commands)
-    for name in MODULES:
-        commands.add_parser(name, help=f"see headvox {name} --help")
+    for name, (_, text) in MODULES.items():
+        commands.add_parser(name, help=text)
     return parser
 
 

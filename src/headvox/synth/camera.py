@@ -109,7 +109,7 @@ def kinect(rng: np.random.Generator | None = None) -> Sensor:
         baseline_m=0.075,
         noise_px=0.07,
         noise_size_px=3.0,
-        hole_px=5.0,
+        hole_px=6.0,
         step_px=1.0 / 8.0,
         fatten_px=1,
         wobble_px=1.5,
@@ -128,11 +128,11 @@ def kinect(rng: np.random.Generator | None = None) -> Sensor:
     return replace(
         usual,
         baseline_m=0.075 if rng.uniform() < 0.5 else -0.075,
-        noise_px=float(rng.uniform(0.02, 0.06 + 0.06 * bad)),
+        noise_px=float(rng.uniform(0.03, 0.08 + 0.05 * bad)),
         noise_size_px=float(rng.uniform(1.5, 5.0)),
         fatten_px=int(rng.integers(0, 3)),
         wobble_px=float(rng.uniform(0.5, 1.2 + 1.5 * bad)),
-        hole_px=float(rng.uniform(3.0, 8.0)),
+        hole_px=float(rng.uniform(4.0, 10.0)),
         flying=float(rng.uniform(0.0, 0.06)),
         weak=float(np.exp(rng.uniform(np.log(0.01), np.log(0.05 + 0.25 * bad)))),
         edge_holes=float(rng.uniform(0.0, 0.3 + 0.7 * bad)),
@@ -235,8 +235,12 @@ def shadow(disparity: F32, second_is_left: bool) -> Mask:
     else:
         elsewhere = columns - disparity
         dark = elsewhere > np.minimum.accumulate(elsewhere[:, ::-1], axis=1)[:, ::-1] + 1.0
-    # Blocks of pixels are matched: slits between small steps of depth are bridged.
-    return np.asarray(ndimage.binary_opening(dark, np.ones((3, 3), np.bool_)))
+    return without_slits(dark)
+
+
+def without_slits(hole: Mask) -> Mask:
+    """Holes without those thinner than three pixels: blocks of pixels are matched, which bridges them."""
+    return np.asarray(ndimage.binary_opening(hole, np.ones((3, 3), np.bool_)))
 
 
 def weak_returns(
@@ -250,7 +254,7 @@ def weak_returns(
         strength = np.log(signal / weak)
     shape = view.ids.shape
     blobs = 0.45 * noise_field(lasting, shape, hole_px) + 0.25 * noise_field(rng, shape, 0.6 * hole_px)
-    return np.asarray(~(strength + blobs > 0.0) & (view.ids != NOTHING))
+    return without_slits(~(strength + blobs > 0.0) & (view.ids != NOTHING))
 
 
 def ragged_edges(

@@ -108,6 +108,8 @@ def _staged(
         if len(actors) < len(postures):
             continue
         lively = animated(rng, people, _within(room.plan, reach_m), actors, acts, duration_s)
+        if any(act == "walk" and not _gets_about(actor) for act, actor in zip(acts, lively, strict=True)):
+            continue
         scene = Scene(int(rng.integers(2**31)), people, room, lively, cameras)
         _, heads = scene.frame(0)
         if all(not head.ignore for head in heads if head.posture != "mannequin"):
@@ -116,6 +118,13 @@ def _staged(
         f"Expected space for {len(postures)} people that the cameras see, got none in {TRIES} rooms.",
         "Take fewer people or another seed.",
     )
+
+
+def _gets_about(actor: Actor) -> bool:
+    """Whether a walker is not hemmed in: at least 0.3 m for every second."""
+    path = np.array([moment.xy for moment in actor.moments])
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    return length >= 0.3 * len(path) / RATE_HZ - 0.1
 
 
 def _stand(T_world_camera: F64) -> F64:

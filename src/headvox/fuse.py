@@ -1,7 +1,7 @@
 """Sensors -> world points: rigid transforms, range and height limits, no NaN.
 
 The detector itself never makes the fused cloud (it voxelizes each sensor's readings as they are read); this stage is
-for those who want the cloud, and it keeps exactly the points that the detector keeps.
+for those who want the cloud. It keeps the points that the detector keeps, but for roundings at the very limits.
 """
 
 from __future__ import annotations

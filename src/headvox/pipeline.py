@@ -360,7 +360,8 @@ def _check_frame(frame: Frame) -> None:
         depth, camera = image.depth, image.intrinsics
         if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
             got = f"{getattr(depth, 'dtype', type(depth).__name__)} {getattr(depth, 'shape', '')}"
-            raise HeadvoxError(f"{image.name}: expected a (height, width) uint16 depth image, got {got}.", "Convert it.")
+            expected = "expected a (height, width) uint16 depth image"
+            raise HeadvoxError(f"{image.name}: {expected}, got {got}.", "Convert it.")
         if depth.size == 0 or depth.shape != (camera.height, camera.width):
             raise HeadvoxError(
                 f"{image.name}: the image is {depth.shape[1]}x{depth.shape[0]}, its camera "
@@ -379,7 +380,8 @@ def _nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
         distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
         finite = distance[np.isfinite(distance)]
         if len(finite) == 0:
-            return HeadvoxError(f"{cloud.name}: all {len(cloud.points)} points are NaN or infinite.", "Nothing was seen.")
+            what = f"{cloud.name}: all {len(cloud.points)} points are NaN or infinite."
+            return HeadvoxError(what, "Is the sensor covered, or too near?")
         middle = float(np.median(finite))
         if middle > 100.0:
             return HeadvoxError(

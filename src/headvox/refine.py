@@ -86,7 +86,8 @@ def fit_spheres(cells, peaks, voxel_m, subdivision, counting, points, spheres): 
             radius_prior = sigma2 / (RADIUS_SIGMA_M * RADIUS_SIGMA_M)
             A[0, 0] = A[1, 1] = A[2, 2] = centre_prior
             A[3, 3] = radius_prior
-            b[0], b[1], b[2], b[3] = -centre_prior * cx, -centre_prior * cy, -centre_prior * cz, radius_prior * (RADIUS_M - r)
+            b[0], b[1], b[2] = -centre_prior * cx, -centre_prior * cy, -centre_prior * cz
+            b[3] = radius_prior * (RADIUS_M - r)
             squares = weights = 0.0
             for k in range(count):
                 dx, dy, dz = points[k, 0] - cx, points[k, 1] - cy, points[k, 2] - cz

@@ -1,7 +1,7 @@
 """Stage 2: what the survivors of the gate look like, as votes of masks or as a boosted sum of look-ups.
 
-*Votes* (the paper): each mask is a signed sum of boxes and votes with its sign; mirrored pairs of boxes that differ cost
-points; the best of a few yaws counts.
+*Votes* (the paper): each mask is a signed sum of boxes and votes with its sign; mirrored pairs of boxes that differ
+cost points; the best of a few yaws counts.
 
 *Stages* (the default): sorted sums of rings of boxes go through small trees whose leaves are added up, all in
 integers; after each stage a candidate below the stage's threshold is dropped, so most cost a few trees only.

@@ -71,8 +71,8 @@ class Lattice:
 
     def limits(self) -> F32:
         """Return the region's limits in parts from the origin, as the kernels read them."""
-        # In float64 up to the last step: a centre in earth coordinates, rounded to float32 first, is off by more than the
-        # spare layer, and the kernels would write outside of the grid.
+        # In float64 up to the last step: a centre in earth coordinates, rounded to float32 first, is off by more
+        # than the spare layer, and the kernels would write outside of the grid.
         region, scale = self.region, 1.0 / self.part_m
         return np.array(
             [

@@ -83,7 +83,7 @@ def test_a_bad_file_is_an_error_that_names_the_setting(tmp_path, text, told):
 
 
 def test_a_missing_file(tmp_path):
-    with pytest.raises(HeadvoxError, match="Configuration .*none.toml: No such file"):
+    with pytest.raises(HeadvoxError, match=r"Configuration .*none\.toml: No such file"):
         load_config(tmp_path / "none.toml")
     with pytest.raises(HeadvoxError, match="Configuration"):
         load_config(tmp_path)

@@ -434,7 +434,7 @@ def test_an_unknown_cascade_is_told_when_the_detector_is_made():
 
 
 def test_a_region_that_no_grid_can_hold_is_refused(make):
-    with pytest.raises(HeadvoxError, match="voxels of 0.005 m"):
+    with pytest.raises(HeadvoxError, match=r"voxels of 0\.005 m"):
         make(max_range_m=50.0, voxel_m=0.005).detect(two_busts())
 
 

@@ -25,7 +25,13 @@ def test_equals_the_naive_twin(seed, voxel, subdivision, counting):
     lattice = Lattice.over(scenes.region(), voxel, subdivision)
     cells = voxelize_points(Cloud("b", scenes.bust(rng, centre)), lattice, counting)
     middle = np.floor((centre - np.array(lattice.origin)) / voxel).astype(int)
-    peaks = [middle, middle + [1, 0, 0], middle - [0, 1, 1], [0, 0, 0], np.array(lattice.shape) - 1]
+    peaks = [
+        middle,
+        middle + np.array((1, 0, 0)),
+        middle - np.array((0, 1, 1)),
+        [0, 0, 0],
+        np.array(lattice.shape) - 1,
+    ]
     wanted = naive.fit_spheres(cells, peaks, voxel, subdivision)
     spheres = fitted(cells, peaks, voxel, subdivision, counting)
     np.testing.assert_allclose(spheres, wanted, rtol=1e-9, atol=1e-9)

@@ -162,7 +162,7 @@ def test_moving_the_centre_by_whole_voxels_keeps_the_cells(voxel):
 
 @pytest.mark.parametrize("voxel", [0.005, 0.02])
 def test_more_voxels_than_can_be_numbered_are_refused(voxel):
-    with pytest.raises(HeadvoxError, match="voxels of 0.0"):
+    with pytest.raises(HeadvoxError, match=r"voxels of 0\.0"):
         Lattice.over(Region((0.0, 0.0, 0.0), 50.0, -1.0, 3.0), voxel, 2)
 
 

@@ -191,25 +191,27 @@ def about(cell, box) -> list[int]:
 
 
 def condition_holds(amount: np.ndarray, cell, condition: Condition, voxel: float, unit: int) -> bool:
-    boxes = [voxel_box(box, voxel) for box in condition.group.boxes]
-    sums = [box_sum(amount, about(cell, box)) for box in boxes]
-    cells = sum(volume(box) for box in boxes) * unit
+    boxes = [(voxel_box(box, voxel), box.weight) for box in condition.group.boxes]
+    sums = [box_sum(amount, about(cell, box)) for box, _ in boxes]
     if condition.rank:
-        got, cells = sorted(sums)[condition.rank - 1], cells / len(boxes)
+        got = sorted(sums)[condition.rank - 1]
+        cells = sum(volume(box) for box, _ in boxes) * unit / len(boxes)
     else:
-        got = sum(sums)
+        got = sum(weight * total for (_, weight), total in zip(boxes, sums, strict=True))
+        cells = sum(weight * volume(box) for box, weight in boxes if weight > 0) * unit
     return round(condition.minimum * cells, 6) <= got <= round(condition.maximum * cells, 6)
 
 
 def gate(amount: np.ndarray, cascade: Cascade, voxel: float) -> np.ndarray:
     """Return the voxels that pass every condition, in the order of x, y, z."""
     unit = 1 if cascade.counting else cascade.subdivision**3
-    passed = []
-    for x in range(amount.shape[0]):
-        for y in range(amount.shape[1]):
-            for z in range(amount.shape[2]):
-                if all(condition_holds(amount, (x, y, z), c, voxel, unit) for c in cascade.conditions):
-                    passed.append((x, y, z))
+    passed = [
+        (x, y, z)
+        for x in range(amount.shape[0])
+        for y in range(amount.shape[1])
+        for z in range(amount.shape[2])
+        if all(condition_holds(amount, (x, y, z), c, voxel, unit) for c in cascade.conditions)
+    ]
     return np.array(passed, np.int32).reshape(-1, 3)
 
 

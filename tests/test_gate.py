@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import naive
 import numpy as np
 import pytest
@@ -26,7 +28,12 @@ trees = [["g.sum", 0.0, 0.0, 1.0]]
 
 
 def cascade_with(gate: str, subdivision: int = 2, occupancy: str = "parts"):
-    return parse_cascade(HEAD.format(subdivision=subdivision, occupancy=occupancy) + gate, "test")
+    """Return a cascade with ``gate`` alone, even one that no file may have."""
+    first = (
+        '[[gate]]\nname = "asked for"\nboxes = [{ centre = [0, 0, 0], size = [0.1, 0.1, 0.1] }]\nmin = 1.0\n'
+    )
+    cascade = parse_cascade(HEAD.format(subdivision=subdivision, occupancy=occupancy) + first + gate, "test")
+    return replace(cascade, conditions=cascade.conditions[1:])
 
 
 def narrow(cells):
@@ -113,6 +120,25 @@ def test_limits_at_their_ends(limits):
         cells = random_cells(np.random.default_rng(0), (5, 6, 7), filled)
         cells[cells > 0] = 255 if filled == 1.0 else cells[cells > 0]
         same_survivors(cells, cascade_with(gate))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("occupancy", ["parts", "count"])
+def test_signed_boxes_equal_the_naive_twin(seed, occupancy):
+    """Layers that should be full against layers that should be empty, and limits below zero."""
+    rng = np.random.default_rng(seed)
+    boxes = []
+    for weight in rng.permutation([1, -1, -2, 3, 1])[: rng.integers(2, 6)]:
+        centre, size = rng.uniform(-0.2, 0.2, 3).round(3), rng.uniform(0.05, 0.3, 3).round(3)
+        boxes.append(f"{{ centre = {centre.tolist()}, size = {size.tolist()}, weight = {weight} }}")
+    boxes.append("{ centre = [0, 0, 0], size = [0.1, 0.1, 0.1] }")
+    low, high = np.sort(rng.uniform(-0.3, 0.5, 2)).round(3)
+    gate = f'[[gate]]\nname = "signed"\nboxes = [{", ".join(boxes)}]\nmin = {low}\nmax = {high}\n'
+    gate += f'[[gate]]\nname = "one side"\nboxes = [{", ".join(boxes[:-1])}, {boxes[-1]}]\nmax = {high}\n'
+    cascade = cascade_with(gate, 2 if occupancy == "parts" else 1, occupancy)
+    for filled in (0.0, 0.2, 0.9):
+        cells = random_cells(rng, (10, 9, 11), filled, cascade.counting)
+        same_survivors(cells, cascade)
 
 
 def test_no_condition_lets_everything_pass():

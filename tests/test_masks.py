@@ -1,11 +1,11 @@
 import copy
-import tomllib
 from dataclasses import replace
 
 import naive
 import numpy as np
 import pytest
 import scenes
+import tomllib
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -191,6 +191,13 @@ WRONG = [
     (STAGES, ["tuned_on"], [1], "tuned_on: expected text"),
     (STAGES, ["colour"], "red", "got 'colour'"),
     (STAGES, ["gate"], {}, "gate: expected a list"),
+    (STAGES, ["gate"], [], "gate: expected a condition with min above 0"),
+    (
+        STAGES,
+        ["gate"],
+        [{"name": "a", "boxes": [CUBE], "max": 0.1}],
+        "gate: expected a condition with min above 0",
+    ),
     (STAGES, ["gate", 0], 3, "gate: expected a table"),
     (STAGES, ["gate", 0, "name"], None, "gate.name: expected text"),
     (STAGES, ["gate", 0, "boxes"], None, "gate shell: expected either boxes or ring"),
@@ -201,13 +208,19 @@ WRONG = [
     (STAGES, ["gate", 0, "boxes", 0, "size"], [0.1, 0.1, -0.1], "gate shell.boxes.size"),
     (STAGES, ["gate", 0, "boxes", 0, "size"], 0.1, "gate shell.boxes.size: expected a list"),
     (STAGES, ["gate", 0, "boxes", 0, "extent"], 0.1, "got 'extent'"),
-    (STAGES, ["gate", 0, "boxes", 0, "weight"], -1, "gate shell.boxes"),  # only masks have weights
+    (STAGES, ["gate", 0, "boxes", 0, "weight"], -1, "gate shell: expected a box of positive weight"),
+    (
+        STAGES,
+        ["gate", 2],
+        {"name": "g", "boxes": [{**CUBE, "weight": 2}], "rank": 1},
+        "gate g: expected no weights",
+    ),
     (STAGES, ["gate", 0, "rank"], 2, "gate shell.rank: expected a whole number from 0 to 1, got 2"),
     (STAGES, ["gate", 2, "rank"], 9, "gate above.rank"),
     (STAGES, ["gate", 0, "rank"], -1, "gate shell.rank"),
     (STAGES, ["gate", 0, "min"], "much", "gate shell.min"),
     (STAGES, ["gate", 0, "min"], NAN, "gate shell.min"),
-    (STAGES, ["gate", 0, "max"], -0.5, "gate shell.max"),
+    (STAGES, ["gate", 0, "max"], NAN, "gate shell.max"),
     (STAGES, ["gate", 2, "ring", "radius"], None, "gate above.ring.radius"),
     (STAGES, ["gate", 2, "ring", "radius"], -0.1, "gate above.ring.radius"),
     (STAGES, ["gate", 2, "ring", "count"], 2, "gate above.ring.count"),
@@ -220,6 +233,7 @@ WRONG = [
     (STAGES, ["stage"], None, "either votes or stages"),
     (STAGES, ["stage"], [], "stage"),
     (STAGES, ["stage", 0, "name"], 1, "stage.name"),
+    (STAGES, ["stage", 0, "trees", 0, 0], "free.sum", "stage a: expected only"),
     (STAGES, ["stage", 0, "keep"], "all", "stage a.keep"),
     (STAGES, ["stage", 0, "trees"], None, "stage a.trees: expected a list"),
     (STAGES, ["stage", 0, "trees", 0], "x", "stage a.trees: expected a number"),

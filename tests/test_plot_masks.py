@@ -43,6 +43,13 @@ name = "clear"
 ring = { radius = 0.2, height = 0.15, size = [0.15, 0.15, 0.15] }
 rank = 8
 max = 0.26
+[[gate]]
+name = "hollow"
+boxes = [
+  { centre = [0, 0, 0], size = [0.25, 0.25, 0.25] },
+  { centre = [0, 0, 0], size = [0.1, 0.1, 0.1], weight = -3 },
+]
+min = -0.5
 [[group]]
 name = "../../$ring"
 ring = { radius = 0.1, height = 0.0, size = [0.1, 0.1, 0.1] }
@@ -81,12 +88,14 @@ def test_influence_is_the_change_of_the_mean_leaf(boosted: Cascade) -> None:
 
 
 def test_pictures_say_what_they_show(boosted: Cascade) -> None:
-    both, clear, ring, around = pictures_of(boosted)
+    both, clear, hollow, ring, around = pictures_of(boosted)
     assert both.words == "the box: at least 3 % full and at most 40 % full"
     assert (both.boxes[0].face, both.boxes[0].edge) == (GREEN, RED)
     assert clear.words == "the fullest of 8 boxes: at most 26 % full"
     assert {painted.face for painted in clear.boxes} == {RED}
     assert len(clear.boxes) == 8
+    assert hollow.words == "the weighted sum of 2 boxes: at least -50 % full"
+    assert [(painted.face, painted.label) for painted in hollow.boxes] == [(GREEN, ""), (RED, "−3×")]
     assert "more surface here speaks for a head; 3 cuts" in ring.words
     assert "more seen-empty space here speaks against a head; 2 cuts" in around.words
     assert (ring.boxes[0].face, around.boxes[0].face) == (GREEN, RED)
@@ -95,7 +104,15 @@ def test_pictures_say_what_they_show(boosted: Cascade) -> None:
 def test_every_picture_of_a_hostile_file_lands_in_the_folder(boosted: Cascade, tmp_path: Path) -> None:
     folder = tmp_path / "new" / "pictures"
     paths = list(plot_cascade(boosted, folder))
-    names = ["gate-01-both", "gate-02-clear", "group-01-ring", "group-02-around", "overview", "cuts"]
+    names = [
+        "gate-01-both",
+        "gate-02-clear",
+        "gate-03-hollow",
+        "group-01-ring",
+        "group-02-around",
+        "overview",
+        "cuts",
+    ]
     assert [path.name for path in paths] == [f"{name}.png" for name in names]
     assert sorted(folder.iterdir()) == sorted(paths)
     for path in paths:

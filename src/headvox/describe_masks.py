@@ -26,7 +26,9 @@ def statistic_in_words(condition: Condition) -> str:
     """Return what a gate condition looks at: the sum of its boxes, or the box at a rank of fullness."""
     count, rank = len(condition.group.boxes), condition.rank
     if rank == 0:
-        return "the box" if count == 1 else f"all {count} boxes together"
+        weighted = any(box.weight != 1 for box in condition.group.boxes)
+        together = f"the weighted sum of {count} boxes" if weighted else f"all {count} boxes together"
+        return "the box" if count == 1 else together
     if rank == 1:
         return f"the emptiest of {count} boxes"
     if rank == count:
@@ -63,7 +65,7 @@ def _heading(cascade: Cascade) -> str:
 
 
 def _limit(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) and value > 0 else ""
+    return f"{value:.4g}" if math.isfinite(value) else ""
 
 
 def _gate(conditions: tuple[Condition, ...]) -> str:
@@ -72,7 +74,7 @@ def _gate(conditions: tuple[Condition, ...]) -> str:
             condition.group.name,
             statistic_in_words(condition),
             _limit(condition.minimum),
-            _limit(condition.maximum) if condition.maximum > 0 else "0",
+            _limit(condition.maximum),
             str(LOOK_UPS_A_BOX * len(condition.group.boxes)),
         ]
         for condition in conditions

@@ -144,20 +144,28 @@ def pictures_of(cascade: Cascade) -> Iterator[Picture]:
 
 
 def _gate_picture(n: int, condition: Condition, unit: str) -> Picture:
-    low, high = condition.minimum > 0, math.isfinite(condition.maximum)
-    looks = statistic_in_words(condition)
+    low, high = math.isfinite(condition.minimum), math.isfinite(condition.maximum)
     limits = [f"at least {_share(condition.minimum, unit)}"] if low else []
     limits += [f"at most {_share(condition.maximum, unit)}"] if high else []
-    face = GREEN if low or not high else RED
-    edge = RED if high else GREEN
-    legend = [(GREEN, "lower limit: must be filled")] if low else []
-    legend += [(RED, "upper limit: must be empty" + (" (the edges)" if low else ""))] if high else []
+    wanted, unwanted = (GREEN, RED) if low else (RED, GREEN)
+    painted = []
+    for box in condition.group.boxes:
+        face, other = (wanted, unwanted) if box.weight > 0 else (unwanted, wanted)
+        painted.append(Painted(box, face, other if low and high else face, _times(box.weight)))
+    filled, empty = (GREEN, "lower limit: must be filled"), (RED, "upper limit: must be empty")
+    legend: tuple[tuple[str, str], ...]
+    if low and high:
+        legend = (filled, (RED, "upper limit, too: edges"))
+    elif any(box.weight < 0 for box in condition.group.boxes):
+        legend = ((GREEN, "counts for it: filled is good"), (RED, "counts against it: empty is good"))
+    else:
+        legend = (filled,) if low else (empty,)
     return Picture(
         f"gate-{n:02d}-{file_name(condition.group.name)}",
         f"gate: {condition.group.name}",
-        f"{looks}: {' and '.join(limits) or 'no limit'}",
-        tuple(Painted(box, face, edge, _times(box.weight)) for box in condition.group.boxes),
-        tuple(legend),
+        f"{statistic_in_words(condition)}: {' and '.join(limits) or 'no limit'}",
+        tuple(painted),
+        legend,
     )
 
 
@@ -210,7 +218,7 @@ def _group_picture(n: int, group: Group, influence: Influence) -> Picture:
         f"group: {group.name}" + ("" if group.channel == "occupied" else f" ({group.channel})"),
         f"more {what} here speaks {effect}; {cuts} move the score by {influence.total:.3g} in all",
         tuple(Painted(box, colour, colour, _times(box.weight)) for box in group.boxes),
-        ((colour, f"{what} speaks {effect} ({influence.change:+.3g})"),),
+        ((colour, f"speaks {effect} ({influence.change:+.3g})"),),
     )
 
 
@@ -262,9 +270,9 @@ def draw(picture: Picture) -> Figure:
     _write(figure, 0.03, 0.945, picture.title, fontsize=19, fontweight="bold", color=INK)
     _write(figure, 0.03, 0.9, picture.words, fontsize=12.5, color=INK)
     low, high = _extent(picture)
-    solid = figure.add_axes((0.0, 0.01, 0.47, 0.87), projection="3d")
+    solid = figure.add_axes((0.0, 0.01, 0.455, 0.87), projection="3d")
     _solid(solid, picture, low, high)
-    places = ((0.5, 0.545, 0.21, 0.35), (0.765, 0.545, 0.21, 0.35), (0.5, 0.075, 0.21, 0.35))
+    places = ((0.5, 0.525, 0.21, 0.34), (0.765, 0.525, 0.21, 0.34), (0.5, 0.07, 0.21, 0.34))
     for section, place in zip(SECTIONS, places, strict=True):
         _section(figure.add_axes(place), section, picture, low, high)
     _legend(figure, picture)
@@ -382,8 +390,7 @@ def _section(
             Rectangle(corner, size[right], size[up], fill=False, edgecolor=painted.edge, zorder=4, **style)
         )
         if painted.label and cut:
-            spot = (centre[right], centre[up])
-            axes.text(*spot, painted.label, ha="center", va="center", fontsize=9, color=INK, zorder=6)
+            axes.text(corner[0] + 0.008, corner[1] + 0.008, painted.label, fontsize=8.5, color=INK, zorder=6)
     axes.plot([0], [0], "+", color=INK, markersize=9, zorder=7)
     axes.set_xlim(low[right], high[right])
     axes.set_ylim(low[up], high[up])
@@ -443,7 +450,7 @@ def contact_sheet(cascade: Cascade, pictures: Sequence[Picture]) -> Figure:
         axes: Any = figure.add_axes((left, bottom - 0.1 / height, 3.0 / width, 3.0 / height), projection="3d")
         _solid(axes, picture, low, high)
         axes.set_axis_off()
-        axes.set_box_aspect(high - low, zoom=1.4)
+        axes.set_box_aspect(high - low, zoom=1.28)
         _write(
             figure,
             left + 0.3 / width,

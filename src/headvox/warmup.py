@@ -50,7 +50,7 @@ def _open(cascade: CompiledCascade) -> CompiledCascade:
     gate, votes, stages = cascade.gate, cascade.votes, cascade.stages
     return replace(
         cascade,
-        gate=replace(gate, low=np.zeros_like(gate.low), high=np.full_like(gate.high, _ANYTHING)),
+        gate=replace(gate, low=np.full_like(gate.low, -_ANYTHING), high=np.full_like(gate.high, _ANYTHING)),
         votes=replace(votes, min_votes=0) if votes else None,
         stages=replace(stages, stage_keep=np.full_like(stages.stage_keep, -_ANYTHING)) if stages else None,
     )

@@ -243,10 +243,21 @@ def test_an_output_that_cannot_be_made_is_explained(recording: Path, tmp_path: P
 # ----------------------------------------------------------------------------------------------- how it ends
 
 
+def heed_ctrl_c() -> None:
+    """Undo what a shell does to its background jobs, should the tests be one."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_ctrl_c_ends_with_130_and_whole_lines(tmp_path: Path) -> None:
     folder = write_recording(tmp_path / "long", 20_000)
     command = [str(COMMAND), "run", str(folder), "--json", "-o", str(tmp_path / "out.jsonl")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heed_ctrl_c,
+    ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         first = process.stdout.readline()
@@ -304,7 +315,7 @@ def test_a_bad_frame_is_told_counted_and_skipped(tmp_path: Path) -> None:
     assert [parse(line)["frame"] for line in done.stdout.splitlines()] == [0, 2]
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith("headvox: frame 1 skipped: ")
-    assert "bad frames               1" in headvox("run", folder).stdout
+    assert ["bad", "frames", "1"] in [line.split() for line in headvox("run", folder).stdout.splitlines()]
 
 
 def test_strict_stops_at_a_bad_frame(tmp_path: Path) -> None:

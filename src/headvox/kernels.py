@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +52,16 @@ class Threads:
         self._pool = ThreadPoolExecutor(count - 1, "headvox") if count > 1 else None
 
     def run(self, function: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> None:
-        """Call ``function`` with each of ``calls``; returns when all have."""
+        """Call ``function`` with each of ``calls``; returns, or raises, when all have ended."""
         if self._pool is None or len(calls) < 2:
             for arguments in calls:
                 function(*arguments)
             return
         others = [self._pool.submit(function, *arguments) for arguments in calls[1:]]
-        function(*calls[0])
+        try:
+            function(*calls[0])
+        finally:
+            wait(others)  # nobody may still write when the caller goes on
         for other in others:
             other.result()
 

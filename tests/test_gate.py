@@ -141,6 +141,22 @@ def test_signed_boxes_equal_the_naive_twin(seed, occupancy):
         same_survivors(cells, cascade)
 
 
+def test_signed_boxes_in_a_volume_that_wraps_around():
+    """The whole volume overflows 16 bits many times over, no box does."""
+    rng = np.random.default_rng(0)
+    gate = """
+[[gate]]
+name = "signed"
+boxes = [{ centre = [0, 0, 0], size = [0.3, 0.3, 0.3], weight = 2 }, { centre = [0, 0, 0.2], size = [0.3, 0.3, 0.1], weight = -3 }]
+min = 0.1
+max = 0.6
+"""
+    cells = random_cells(rng, (32, 30, 22), 0.9) | np.uint8(0xF1)
+    cells[:, :, 9:13] = 0
+    assert naive.weights(cells).sum() > 0xFFFF
+    assert len(same_survivors(cells, cascade_with(gate))) > 100
+
+
 def test_no_condition_lets_everything_pass():
     cells = np.zeros((3, 4, 5), np.uint8)
     assert len(same_survivors(cells, cascade_with(""))) == 60

@@ -85,3 +85,15 @@ def test_a_million_points_in_one_cell():
         1_000_000,
         0,
     ]
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.uint32])
+def test_a_volume_longer_than_its_cells_goes_on_over_empty_ones(dtype):
+    rng = np.random.default_rng(2)
+    cells = rng.integers(0, 256, (6, 5, 9)).astype(np.uint8)
+    cells[3] = 0
+    S = np.full((5, 5, 16), 77, dtype)
+    integrate(cells, np.array([1, 1, 2, 4, 4, 7]), False, S)
+    padded = np.zeros((4, 4, 15), np.uint8)
+    padded[:, :, :6] = cells[1:5, 1:5, 2:8]
+    np.testing.assert_array_equal(S, naive.integral_volume(padded))

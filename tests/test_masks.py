@@ -349,6 +349,14 @@ def test_boxes_that_would_fill_the_memory_are_refused():
         compile_cascade(parse_cascade(write(table), "wide"), 0.005)
 
 
+def test_weights_that_no_integral_volume_can_hold_are_refused():
+    table = changed(
+        STAGES, ["gate", 0, "boxes"], [{"centre": [0, 0, 0], "size": [2, 2, 2], "weight": 1000}] * 64
+    )
+    with pytest.raises(HeadvoxError, match="32 bits"):
+        compile_cascade(parse_cascade(write(table), "heavy"), 0.02)
+
+
 # ---------------------------------------------------------------------------------------------------------- compiled
 
 

@@ -1,0 +1,53 @@
+import threading
+import time
+
+import pytest
+
+from headvox.kernels import Threads
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("calls", [0, 1, 2, 5])
+def test_every_call_is_made_once(count, calls):
+    threads = Threads(count)
+    done = []
+    threads.run(lambda k: done.append(k), [(k,) for k in range(calls)])
+    assert sorted(done) == list(range(calls))
+    threads.close()
+
+
+def test_one_thread_is_the_callers():
+    threads = Threads(1)
+    seen = set()
+    threads.run(lambda: seen.add(threading.current_thread()), [(), (), ()])
+    assert seen == {threading.current_thread()}
+    threads.close()
+
+
+def test_two_threads_run_side_by_side():
+    threads = Threads(2)
+    both = threading.Barrier(2, timeout=30)
+    threads.run(both.wait, [(), ()])
+    assert not both.broken
+    threads.close()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("bad", [0, 1])
+def test_an_error_in_any_call_reaches_the_caller_after_all_have_ended(count, bad):
+    threads = Threads(count)
+    ended = []
+
+    def work(k):
+        if k == bad:
+            raise ValueError(f"call {k}")
+        time.sleep(0.05)
+        ended.append(k)
+
+    with pytest.raises(ValueError, match=f"call {bad}"):
+        threads.run(work, [(0,), (1,)])
+    if count > 1:
+        assert ended == [1 - bad]
+    threads.run(work, [(2,), (3,)])
+    assert set(ended) >= {2, 3}
+    threads.close()

@@ -139,13 +139,13 @@ def _run(args: argparse.Namespace) -> int:
             live.note(f"no SOURCE given: running the sample that ships with headvox, {path}")
         detector = stack.enter_context(closing(Detector(config)))
         sinks: list[Sink] = []
-        if (
-            args.output is not None
-        ):  # before the stream: what was printed is in the file, however the run ends
+        if args.output is not None:
+            # Before the stream: what was printed is in the file, however the run ends.
             _keep_input(args.output, [path, args.config, config.cascade])
             sinks.append(stack.enter_context(closing(open_sink(args.output))))
         if args.json:
             sinks.append(JsonStream(sys.stdout))
+        live.show("getting ready (the first time compiles, for about half a minute)")
         warm_up(config)
         report = run(
             source,

@@ -29,16 +29,21 @@ class Live:
     def frame(self, report: Report) -> None:
         """Show the state of the run."""
         now = time.monotonic()
-        if not self._watched or now < self._next:
+        if now < self._next:
             return
         self._next = now + EVERY_S
         hertz = report.frames / report.seconds if report.seconds > 0 else 0.0
         heads, ms = (len(report.last.heads), report.last.latency_ms) if report.last else (0, 0.0)
         rate = f"{hertz:.1f} Hz  {ms:.1f} ms"
         text = f"frame {report.frames}{self._of}  heads {heads}  {rate}  dropped {report.bad}"
-        self._stream.write("\r" + text.ljust(self._shown))
-        self._stream.flush()
-        self._shown = len(text)
+        self.show(text)
+
+    def show(self, text: str) -> None:
+        """Show ``text`` until the next thing is to be shown."""
+        if self._watched:
+            self._stream.write("\r" + text.ljust(self._shown))
+            self._stream.flush()
+            self._shown = len(text)
 
     def close(self) -> None:
         """Take the live line away."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 
 from headvox.data import F64
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from headvox.synth.scene import People
 
 Rng = np.random.Generator
+Mask = npt.NDArray[np.bool_]
 
 RATE_HZ = 30.0
 STRIDE_M = 1.35  # two steps
@@ -122,18 +124,19 @@ def stroll(
     return paths
 
 
-def _roomy(plan: FloorPlan) -> Any:
+def _roomy(plan: FloorPlan) -> Mask:
     """Cells with 30 cm around them that no thing takes; people give way to each other."""
     reach = round(0.3 / CELL_M)
-    return ~ndimage.binary_dilation(np.pad(plan.taken, 1, constant_values=True), iterations=reach)[1:-1, 1:-1]
+    walled = np.pad(plan.taken, 1, constant_values=True)
+    return np.asarray(~ndimage.binary_dilation(walled, iterations=reach)[1:-1, 1:-1])
 
 
-def _is_free(plan: FloorPlan, free: Any, xy: F64) -> bool:
-    cell = np.floor((xy - plan.origin) / CELL_M).astype(int)
-    return bool((cell >= 0).all() and (cell < free.shape).all() and free[cell[0], cell[1]])
+def _is_free(plan: FloorPlan, free: Mask, *points: F64) -> bool:
+    cells = plan.cells(np.reshape(points, (-1, 2)))
+    return len(cells) == len(points) and bool(free[cells[:, 0], cells[:, 1]].all())
 
 
-def _goal(rng: Rng, plan: FloorPlan, free: Any, start: F64, others: F64) -> F64:
+def _goal(rng: Rng, plan: FloorPlan, free: Mask, start: F64, others: F64) -> F64:
     """A free place that can be reached straight, past the ``others``; the start itself if there is none."""
     cells = np.argwhere(free)
     best = start
@@ -143,7 +146,7 @@ def _goal(rng: Rng, plan: FloorPlan, free: Any, start: F64, others: F64) -> F64:
         line = line[np.hypot(*(line - start).T) > 0.3]
         apart = np.linalg.norm(line[:, None] - others, axis=2) > PERSONAL_M
         farther = np.hypot(*(goal - start)) > np.hypot(*(best - start))
-        if farther and apart.all() and all(_is_free(plan, free, p) for p in line):
+        if farther and apart.all() and _is_free(plan, free, *line):
             best = goal
             if np.hypot(*(best - start)) > 1.5:
                 break
@@ -202,6 +205,12 @@ def rising(rng: Rng, sitting: Moment, standing: Pose, steps: int) -> list[Moment
     ]
 
 
+def _can_rise(plan: FloorPlan, sitting: Moment) -> bool:
+    ahead = np.array([np.cos(sitting.heading_rad), np.sin(sitting.heading_rad)])
+    knees = np.array(sitting.xy) + np.linspace(0.45, 0.6, 4)[:, None] * ahead
+    return _is_free(plan, ~plan.taken, *knees)
+
+
 def _in_front(sitting: Moment) -> tuple[float, float]:
     """Where somebody who sits will stand."""
     ahead = 0.32 * np.array([np.cos(sitting.heading_rad), np.sin(sitting.heading_rad)])
@@ -213,8 +222,13 @@ def live(
 ) -> list[list[Moment]]:
     """Bring placed people to life. ``acts`` says who does what: "walk", "turn", "rise" or "stay".
 
-    Walkers keep to the free floor of ``plan`` and out of each other's way; "rise" is for people who sit.
+    Walkers keep to the free floor of ``plan`` and out of each other's way; "rise" is for people who sit, and
+    who stay when something stands in front of them.
     """
+    acts = [
+        "stay" if act == "rise" and not _can_rise(plan, moment) else act
+        for act, moment in zip(acts, posed, strict=True)
+    ]
     walkers = [k for k, act in enumerate(acts) if act == "walk"]
     place = np.array([moment.xy for moment in posed]).reshape(-1, 2)
     heading = np.array([moment.heading_rad for moment in posed])

@@ -401,21 +401,20 @@ class FloorPlan:
         self.taken: npt.NDArray[np.bool_] = np.zeros((int(x_m / CELL_M), int(y_m / CELL_M)), np.bool_)
         self.people = self.taken.copy()
 
-    def _cells(self, xy: F64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    def cells(self, xy: F64) -> npt.NDArray[np.int64]:
+        """The cells (K, 2) under those of the points (N, 2) that are inside the room."""
         cells = np.floor((xy - self.origin) / CELL_M).astype(np.int64)
-        return cells, ((cells >= 0) & (cells < self.taken.shape)).all(axis=1)
+        return np.asarray(cells[((cells >= 0) & (cells < self.taken.shape)).all(axis=1)])
 
     def conflict(self, xy: F64) -> float:
         """Share (0..1) of the points (N, 2) that are over taken cells or outside."""
-        cells, inside = self._cells(xy)
-        i, j = cells[inside].T
+        i, j = self.cells(xy).T
         free = ~(self.taken[i, j] | self.people[i, j])
-        return 1.0 - float(free.sum()) / max(len(cells), 1)
+        return 1.0 - float(free.sum()) / max(len(xy), 1)
 
     def take(self, xy: F64, by_person: bool = False) -> None:
         """Mark the cells under the points (N, 2)."""
-        cells, inside = self._cells(xy)
-        i, j = cells[inside].T
+        i, j = self.cells(xy).T
         (self.people if by_person else self.taken)[i, j] = True
 
     def middle(self, cells: npt.NDArray[np.int64]) -> F64:

@@ -51,6 +51,30 @@ def test_turned_cameras_equal_the_naive_twin():
     assert seen.sum() > 100
 
 
+def test_depths_about_the_margins_equal_the_naive_twin():
+    """Surfaces within a few millimetres of where a layer of cells turns from one state to the next."""
+    rng = np.random.default_rng(8)
+    T = scenes.looking_along_x(-1.0, 0.02, 0.01)
+    lattice = Lattice.over(REGION, 0.05, 1)
+    far = 1.0 + lattice.origin[0] + 0.05 * (rng.integers(0, lattice.shape[0], (60, 80)) + 0.5)
+    near_margin = (
+        far
+        + rng.choice([-1.0, 1.0], far.shape) * (0.03 + 0.004 * far**2)
+        + rng.uniform(-0.001, 0.001, far.shape)
+    )
+    image = DepthImage(
+        "d",
+        np.round(near_margin / 0.0001).astype(np.uint16),
+        Intrinsics(80, 60, 60.0, 60.0, 39.6, 29.7, 0.0001),
+        T,
+    )
+    cells = np.argwhere(np.ones(lattice.shape)).astype(np.int32)
+    one = np.array([[0, 1, 0, 1, 0, 1]], np.int32)
+    wanted = naive.count_seen((image,), naive.lattice_over(REGION, 0.05, 1), cells, one)
+    np.testing.assert_array_equal(count_seen((image,), lattice, cells, one), wanted)
+    assert wanted.sum(axis=(0, 1)).min() > 1000
+
+
 def test_before_the_surface_is_empty_and_behind_it_hidden():
     """A wall 1 m before a camera at x = -1: what the channels are, in plain geometry."""
     T = scenes.looking_along_x(-1.0, 0.0, 0.0)

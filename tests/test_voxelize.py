@@ -210,6 +210,50 @@ def test_one_pixel(value, scale, points):
     assert same_grids(image, Region((0.0, 0.0, 0.0), 0.8, -0.1, 0.8)).sum() == points
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_pixels_on_the_borders_of_cells_equal_the_naive_twin(seed):
+    """Coordinates that are whole numbers but for the last bit: the sums must be taken as documented."""
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
+    T[:3, 3] = rng.integers(-3, 4, 3) * 0.025
+    camera = Intrinsics(33, 25, 3.0, 3.0, 16.0, 12.0, 0.025 / 15)
+    depth = (rng.integers(0, 20, (25, 33)) * 15).astype(np.uint16)
+    for subdivision in (1, 2):
+        counts = same_grids(
+            DepthImage("d", depth, camera, T), scenes.region(0.9, -0.9, 0.9), 0.05, subdivision
+        )
+        assert counts.sum() > 100
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_turned_points_on_the_borders_of_cells_equal_the_naive_twin(seed):
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = [[0.6, -0.48, 0.64], [0.8, 0.36, -0.48], [0.0, 0.8, 0.6]]
+    points = (rng.integers(-8, 9, (600, 3)) * 0.125).astype(np.float32)
+    assert same_grids(Cloud("c", points, T), scenes.region(0.9, -0.9, 0.9)).sum() > 50
+
+
+def test_the_range_limit_itself_is_out():
+    """All of these distances are exact in float32."""
+    region = Region((0.0, 0.0, 0.0), 1.0, -2.0, 2.0)
+    on_limit = np.array([[1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0.0, -1.0, 0.0]], np.float32)
+    assert same_grids(Cloud("on", on_limit), region, 0.0625).sum() == 0
+    assert same_grids(Cloud("in", on_limit * np.float32(1 - 2**-20)), region, 0.0625).sum() == 5
+    camera = Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0, 1 / 1024)
+    for value, count in ((1023, 1), (1024, 0), (1025, 0)):
+        image = DepthImage("d", np.full((1, 1), value, np.uint16), camera, np.eye(4))
+        assert same_grids(image, region, 0.0625).sum() == count
+
+
+@pytest.mark.parametrize("height", [-0.5, 0.25])
+def test_height_limits_are_half_open(height):
+    region = Region((0.0, 0.0, 0.0), 1.0, -0.5, 0.25)
+    points = np.array([[0, 0, height]], np.float32)
+    assert same_grids(Cloud("z", points), region, 0.0625).sum() == (height < 0)
+
+
 def test_a_pixel_without_return_is_no_point_at_the_camera():
     image = DepthImage("d", np.zeros((4, 5), np.uint16), Intrinsics(5, 4, 3.0, 3.0, 2.0, 2.0), np.eye(4))
     assert same_grids(image, scenes.region()).sum() == 0

@@ -30,9 +30,9 @@ class DetectorConfig:
     """Points farther than this from the centre are dropped."""
     centre: tuple[float, float, float] | None = None
     """Centre of the region in the world; by default the mean position of the sensors, or the origin if unknown."""
-    min_height_m: float = -0.6
+    min_height_m: float = -0.5
     """World height below which points are dropped."""
-    max_height_m: float = 2.6
+    max_height_m: float = 2.5
     """World height above which points are dropped."""
     min_score: float | None = None
     """Heads that score less are dropped; by default the cascade's own threshold."""

@@ -1,11 +1,14 @@
-"""Stage 1: the gate. A few box sums, for every voxel of the volume, throw out almost all of them.
+"""Stage 1: the gate. A few signed box sums, for every voxel of the volume, throw out almost all of them.
 
-It knows nothing of orientation. A voxel passes when each condition's statistic (a sum over boxes, or the kth smallest
-of the sums of a group) lies within its limits. The boxes' corners are read a column of voxels at a time, so the
-compiler turns every step into vector instructions; a column is left as soon as no voxel of it is alive.
+It knows nothing of orientation. A voxel passes when each condition's statistic (a weighted sum over boxes, or the kth
+smallest of the sums of a group) lies within its limits. The boxes' corners are read a column of voxels at a time, so
+the compiler turns every step into vector instructions; a column is left as soon as no voxel of it is alive.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,72 +17,74 @@ from headvox.integral import Integral
 from headvox.kernels import kernel, rule
 from headvox.masks import CompiledGate
 
+I16_OR_I32 = npt.NDArray[Any]
+
 
 @rule
-def _column_sums(S, x, y, box, pad, edge, out):  # type: ignore[no-untyped-def]
-    """Write to ``out`` the sums over ``box`` about every voxel of the column x, y."""
-    nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
+def _column_sums(S, x, y, box, weight, pad, edge, out, adding):  # type: ignore[no-untyped-def]
+    """Write to ``out``, or add to it, the weighted sums over ``box`` about every voxel of the column x, y."""
+    nx, ny, n = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
     x0, x1 = min(max(x + box[0], 0), nx), min(max(x + box[1], 0), nx)
     y0, y1 = min(max(y + box[2], 0), ny), min(max(y + box[3], 0), ny)
     a, b, c, d = S[x1, y1], S[x0, y1], S[x1, y0], S[x0, y0]
-    middle = edge[pad : pad + nz + 1]
-    for z in range(nz + 1):
+    middle = edge[pad : pad + n]
+    for z in range(n):
         middle[z] = (a[z] - b[z]) - (c[z] - d[z])
-    top = middle[nz]
-    above = edge[pad + nz + 1 :]
+    top = middle[n - 1]
+    above = edge[pad + n :]
     for z in range(pad):
         above[z] = top
-    low = edge[pad + box[4] : pad + box[4] + nz]
-    high = edge[pad + box[5] : pad + box[5] + nz]
-    for z in range(nz):
-        out[z] = high[z] - low[z]
+    low = edge[pad + box[4] : pad + box[4] + n]
+    high = edge[pad + box[5] : pad + box[5] + n]
+    if adding:
+        for z in range(n):
+            out[z] += weight * (high[z] - low[z])
+    else:
+        for z in range(n):
+            out[z] = weight * (high[z] - low[z])
 
 
 @kernel
-def gate_columns(S, first, last, boxes, start, rank, low, high, least, survivors):  # type: ignore[no-untyped-def]
+def gate_columns(  # type: ignore[no-untyped-def]
+    S, first, last, top, boxes, weights, start, rank, limits, least, edge, sums, alive, survivors
+):
     """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many there are.
 
-    ``least`` is x0 x1 y0 y1 and a count: a window that holds fewer in the whole column cannot pass, whatever z.
-    Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
+    Only voxels below ``top`` count; S may be longer, so that a column is a whole number of vectors. ``least`` is x0 x1
+    y0 y1 and a count: a window that holds fewer in the whole column cannot pass, whatever z. ``edge``, ``sums`` and
+    ``alive`` are working memory. Counting goes on past the end of ``survivors``, so that the caller can tell how many
+    did not fit.
     """
-    nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
-    pad = 0
-    for i in range(boxes.shape[0]):
-        pad = max(pad, max(-boxes[i, 4], boxes[i, 5]))
-    edge = np.zeros(nz + 1 + 2 * pad, S.dtype)
-    most = 1
-    for i in range(rank.shape[0]):
-        most = max(most, start[i + 1] - start[i])
-    sums = np.empty((most, nz), S.dtype)
-    alive = np.empty(nz, np.uint8)
+    nx, ny, n = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
+    pad = (edge.shape[0] - n) // 2
+    edge[:pad] = 0
     found = 0
     # A whole column may wrap around where no box does; a voxel has 8 parts at most.
-    fits = S.itemsize > 2 or (least[1] - least[0]) * (least[3] - least[2]) * nz * 8 <= 0xFFFF
+    fits = S.itemsize > 2 or (least[1] - least[0]) * (least[3] - least[2]) * n * 8 <= 0xFFFF
     for x in range(first, last):
         wx0, wx1 = min(max(x + least[0], 0), nx), min(max(x + least[1], 0), nx)
         for y in range(ny):
             wy0, wy1 = min(max(y + least[2], 0), ny), min(max(y + least[3], 0), ny)
-            window = (S[wx1, wy1, nz] - S[wx0, wy1, nz]) - (S[wx1, wy0, nz] - S[wx0, wy0, nz])
+            window = (S[wx1, wy1, n - 1] - S[wx0, wy1, n - 1]) - (S[wx1, wy0, n - 1] - S[wx0, wy0, n - 1])
             if fits and (window & 0xFFFFFFFF) < least[4]:
                 continue
             alive[:] = 1
             any_alive = True
             for i in range(rank.shape[0]):
-                count = start[i + 1] - start[i]
-                for k in range(count):
-                    _column_sums(S, x, y, boxes[start[i] + k], pad, edge, sums[k])
-                if count > 1:
-                    if rank[i] == 0:
-                        for k in range(1, count):
-                            _add(sums[0], sums[k])
-                    else:
-                        _sort(sums, count, rank[i])
-                chosen = sums[0] if rank[i] == 0 else sums[rank[i] - 1]
-                any_alive = _within(chosen, low[i], high[i], alive)
+                begin, count = start[i], start[i + 1] - start[i]
+                if rank[i] == 0:
+                    for k in range(count):
+                        _column_sums(S, x, y, boxes[begin + k], weights[begin + k], pad, edge, sums[0], k > 0)
+                    any_alive = _within(sums[0], limits[i, 0], limits[i, 1], alive)
+                else:
+                    for k in range(count):
+                        _column_sums(S, x, y, boxes[begin + k], 1, pad, edge, sums[k], False)
+                    _sort(sums, count, rank[i])
+                    any_alive = _within(sums[rank[i] - 1], limits[i, 0], limits[i, 1], alive)
                 if not any_alive:
                     break
             if any_alive:
-                for z in range(nz):
+                for z in range(top):
                     if alive[z]:
                         if found < survivors.shape[0]:
                             survivors[found, 0] = x
@@ -87,12 +92,6 @@ def gate_columns(S, first, last, boxes, start, rank, low, high, least, survivors
                             survivors[found, 2] = z
                         found += 1
     return found
-
-
-@rule
-def _add(a, b):  # type: ignore[no-untyped-def]
-    for z in range(a.shape[0]):
-        a[z] += b[z]
 
 
 @rule
@@ -120,11 +119,8 @@ def _order(a, b):  # type: ignore[no-untyped-def]
 @rule
 def _within(sums, low, high, alive):  # type: ignore[no-untyped-def]
     left = np.uint8(0)
-    lowest = np.uint32(min(max(low, 0), 0xFFFFFFFF))
-    highest = np.uint32(min(max(high, 0), 0xFFFFFFFF))
     for z in range(sums.shape[0]):
-        value = np.uint32(sums[z])
-        alive[z] &= np.uint8((value >= lowest) & (value <= highest))
+        alive[z] &= np.uint8((sums[z] >= low) & (sums[z] <= high))
         left |= alive[z]
     return left != 0
 
@@ -136,17 +132,50 @@ def column_bound(gate: CompiledGate) -> npt.NDArray[np.int64]:
     """
     best = np.zeros(5, dtype=np.int64)
     for i, low in enumerate(gate.low):
-        if gate.start[i + 1] - gate.start[i] == 1 and low > best[4]:
-            best[:4] = gate.boxes[gate.start[i], :4]
+        first = gate.start[i]
+        if gate.start[i + 1] - first == 1 and gate.weights[first] == 1 and low > best[4]:
+            best[:4] = gate.boxes[first, :4]
             best[4] = low
     return best
 
 
+@dataclass(frozen=True, slots=True)
+class GateTables:
+    """A gate for one type of integral volume, and the working memory of one thread."""
+
+    tables: tuple[npt.NDArray[Any], ...]
+    """Boxes, weights, starts, ranks, limits in the type of the sums, and the column bound."""
+    edge: npt.NDArray[Any]
+    sums: I16_OR_I32
+    """Flat: :meth:`memory` cuts it to the length of the columns."""
+    alive: npt.NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, gate: CompiledGate, sum_type: np.dtype[Any], length: int) -> GateTables:
+        """Return the tables for an integral volume of ``sum_type`` whose columns are ``length`` long."""
+        signed = np.dtype(f"i{sum_type.itemsize}")
+        most = int(np.diff(gate.start).max(initial=1))
+        reach = int(np.abs(gate.boxes[:, 4:]).max(initial=0))
+        least, greatest = np.iinfo(signed).min, np.iinfo(signed).max
+        limits = np.clip(np.stack([gate.low, gate.high], axis=1), least, greatest).astype(signed)
+        return cls(
+            (gate.boxes, gate.weights, gate.start, gate.rank, limits, column_bound(gate)),
+            np.zeros(length + 2 * reach, sum_type),
+            np.empty(most * length, signed),
+            np.empty(length, np.uint8),
+        )
+
+    def memory(self, length: int) -> tuple[npt.NDArray[Any], ...]:
+        """Return edge, sums and alive for columns of ``length``, at most the length they were made for."""
+        spare, most = len(self.edge) - len(self.alive), len(self.sums) // len(self.alive)
+        return self.edge[: length + spare], self.sums[: most * length].reshape(most, length), self.alive[:length]
+
+
 def pass_gate(S: Integral, gate: CompiledGate) -> npt.NDArray[np.int32]:
     """Return the voxels (n, 3) of the integral volume ``S`` that pass, in the order of x, y, z."""
-    least = column_bound(gate)
-    arguments = (gate.boxes, gate.start, gate.rank, gate.low, gate.high, least)
-    count = gate_columns(S, 0, S.shape[0] - 1, *arguments, np.empty((0, 3), np.int32))
+    tables = GateTables.of(gate, S.dtype, S.shape[2])
+    arguments = (S, 0, S.shape[0] - 1, S.shape[2] - 1, *tables.tables, *tables.memory(S.shape[2]))
+    count = gate_columns(*arguments, np.empty((0, 3), np.int32))
     survivors = np.empty((count, 3), np.int32)
-    gate_columns(S, 0, S.shape[0] - 1, *arguments, survivors)
+    gate_columns(*arguments, survivors)
     return survivors

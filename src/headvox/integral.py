@@ -18,6 +18,9 @@ import numpy.typing as npt
 
 from headvox.kernels import kernel, rule
 
+VECTOR = 32
+"""A column of an integral volume in steady use is a whole number of vectors of this many sums."""
+
 PARTS = np.array([value.bit_count() for value in range(256)], dtype=np.uint8)
 
 Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
@@ -25,13 +28,15 @@ Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
 
 @kernel
 def integrate(cells, box, counting, S):  # type: ignore[no-untyped-def]
-    """Fill ``S`` (bx+1, by+1, bz+1) with the integral volume of the cells in ``box``.
+    """Fill ``S`` (bx+1, by+1, bz+1 or longer) with the integral volume of the cells in ``box``.
 
-    ``box`` is lowest and highest cell (inclusive) of the grid ``cells``. A parts grid is summed by its bits.
+    ``box`` is lowest and highest cell (inclusive) of the grid ``cells``. A parts grid is summed by its bits. Where S is
+    longer than the box, as if empty cells went on above it.
     """
     x0, y0, z0 = box[0], box[1], box[2]
-    nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
-    row = np.empty(nz + 1, S.dtype)
+    nx, ny, length = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
+    nz = min(box[5] - box[2] + 1, length - 1)
+    row = np.empty(length, S.dtype)
     S[0] = 0
     for x in range(nx):
         row[:] = 0
@@ -43,9 +48,10 @@ def integrate(cells, box, counting, S):  # type: ignore[no-untyped-def]
                 for z in range(nz):
                     total += column[z] if counting else PARTS[column[z] & 255]
                     row[z + 1] += total
+                row[nz + 1 :] = row[nz]
             below = S[x, y + 1]
             out = S[x + 1, y + 1]
-            for z in range(nz + 1):
+            for z in range(length):
                 out[z] = below[z] + row[z]
 
 

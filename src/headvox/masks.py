@@ -62,7 +62,10 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Stage 1: a statistic of a group's sums must lie between two shares. ``rank`` 0 is the sum, k the kth smallest."""
+    """Stage 1: a statistic of a group's sums must lie between two shares.
+
+    ``rank`` 0 is the weighted sum, as a share of the volume of the boxes of positive weight; k is the kth smallest.
+    """
 
     group: Group
     rank: int
@@ -257,12 +260,17 @@ class _Reader:
     def condition(self, value: object, where: str) -> Condition:
         table = self.table(value, where, {"name", "boxes", "ring", "rank", "min", "max"})
         name = self.text(table.get("name"), f"{where}.name")
-        boxes = self.boxes(table, f"gate {name}")
+        boxes = self.boxes(table, f"gate {name}", weighted=True)
+        rank = self.whole(table.get("rank", 0), f"gate {name}.rank", 0, len(boxes))
+        if rank and any(box.weight != 1 for box in boxes):
+            raise self.error(f"gate {name}", "no weights beside a rank", rank)
+        if all(box.weight <= 0 for box in boxes):
+            raise self.error(f"gate {name}", "a box of positive weight", [box.weight for box in boxes])
         return Condition(
             Group(name, boxes),
-            self.whole(table.get("rank", 0), f"gate {name}.rank", 0, len(boxes)),
-            self.number(table.get("min", 0.0), f"gate {name}.min"),
-            self.number(table.get("max", math.inf), f"gate {name}.max", 0.0, math.inf),
+            rank,
+            self.number(table.get("min", -math.inf), f"gate {name}.min", -math.inf),
+            self.number(table.get("max", math.inf), f"gate {name}.max", -LARGEST, math.inf),
         )
 
     def group(self, value: object, where: str) -> Group:
@@ -349,6 +357,16 @@ class _Reader:
                 raise self.error(f"group {group.name}", "a name of its own", group.name)
             names.add(group.name)
         features = {f"{group.name}.{statistic}" for group in groups for statistic in statistics(group)}
+        conditions = tuple(self.condition(entry, "gate") for entry in self.items(table.get("gate", []), "gate"))
+        if all(condition.minimum <= 0.0 for condition in conditions):
+            raise self.error("gate", "a condition with min above 0, as only places near points are searched", "none")
+        stages = tuple(self.stage(entry, features) for entry in self.items(table.get("stage", []), "stage"))
+        blind = {group.name for group in groups if group.channel == "occupied"}
+        for tree in stages[0].trees if stages else ():
+            for feature, _ in cuts(tree):
+                if feature.rpartition(".")[0] not in blind:
+                    # Neighbours compete by what is occupied; only the winners are looked at through the cameras.
+                    raise self.error(f"stage {stages[0].name}", 'only "occupied" groups, as it is the first', feature)
         min_score = self.number(table.get("min_score"), "min_score")
         return Cascade(
             name=self.text(table.get("name"), "name"),
@@ -356,10 +374,10 @@ class _Reader:
             voxel_m=self.number(table.get("voxel_m"), "voxel_m", 0.005, 0.2),
             subdivision=subdivision,
             counting=occupancy == "count",
-            conditions=tuple(self.condition(entry, "gate") for entry in self.items(table.get("gate", []), "gate")),
+            conditions=conditions,
             votes=self.votes(table["votes"]) if "votes" in table else None,
             groups=groups,
-            stages=tuple(self.stage(entry, features) for entry in self.items(table.get("stage", []), "stage")),
+            stages=stages,
             min_score=min_score,
             min_score_occupied=self.number(table.get("min_score_occupied", min_score), "min_score_occupied"),
             tuned_on=tuple(self.text(entry, "tuned_on") for entry in self.items(table.get("tuned_on", []), "tuned_on")),
@@ -415,6 +433,7 @@ class CompiledGate:
     """Stage 1 in voxels: condition i asks boxes ``start[i]`` to ``start[i + 1]`` for ``low[i] <= . <= high[i]``."""
 
     boxes: I32
+    weights: I32
     start: I32
     rank: I32
     low: I64
@@ -481,20 +500,33 @@ def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledC
     gate = _compile_gate(cascade, voxel, unit)
     votes = _compile_votes(cascade.votes, voxel) if cascade.votes else None
     stages = _compile_stages(cascade, voxel, unit) if cascade.stages else None
-    # The gate adds up the boxes of a condition of rank 0 in the type of the volume; stage 2 adds up in 64 bits.
-    starts, ends = gate.start[:-1][gate.rank == 0], gate.start[1:][gate.rank == 0]
-    sums = [volume(gate.boxes[start:end]) for start, end in zip(starts, ends, strict=True)]
+    # The gate adds up the boxes of a condition in the type of the volume, signed; stage 2 adds up in 64 bits.
+    sums = [
+        2 * sum(abs(int(w)) * volume(box[None]) for w, box in zip(gate.weights[a:b], gate.boxes[a:b], strict=True))
+        for a, b in zip(gate.start[:-1], gate.start[1:], strict=True)
+    ]
     tables = [gate.boxes]
     if votes:
         tables += [votes.boxes, votes.pairs.reshape(-1, 6)]
     if stages:
         tables.append(stages.boxes)
     sums += [volume(box[None]) for table in tables for box in table]
-    return CompiledCascade(cascade, voxel, gate, votes, stages, max(sums, default=1) * unit)
+    largest = max(sums, default=1) * unit
+    if largest > 0xFFFFFFFF:
+        raise HeadvoxError(
+            f"Cascade {cascade.name}: in voxels of {voxel:g} m a condition of its gate outgrows 32 bits.",
+            "Make its boxes smaller or fewer, or their weights less.",
+        )
+    return CompiledCascade(cascade, voxel, gate, votes, stages, largest)
 
 
 def _box_table(boxes: list[list[int]]) -> I32:
     return np.array(boxes, dtype=np.int32).reshape(-1, 6)
+
+
+def _rounded(value: float) -> float:
+    """Take away what binary fractions add: 0.1 * 30 is not 3."""
+    return round(value, 6) if math.isfinite(value) else value
 
 
 def _floor(value: float) -> int:
@@ -503,19 +535,24 @@ def _floor(value: float) -> int:
 
 def _compile_gate(cascade: Cascade, voxel: float, unit: int) -> CompiledGate:
     boxes: list[list[int]] = []
+    weights: list[int] = []
     start, ranks, lows, highs = [0], [], [], []
     for condition in cascade.conditions:
         mine = [voxel_box(box, voxel) for box in condition.group.boxes]
-        size: float = volume(_box_table(mine)) * unit
+        mine_weights = [box.weight for box in condition.group.boxes]
+        pairs = zip(mine, mine_weights, strict=True)
+        size: float = sum(w * volume(_box_table([box])) for box, w in pairs if w > 0) * unit
         if condition.rank:
             size /= len(mine)
         boxes += mine
+        weights += mine_weights
         start.append(len(boxes))
         ranks.append(condition.rank)
-        lows.append(-_floor(-round(condition.minimum * size, 6)))
-        highs.append(_floor(round(condition.maximum * size, 6) if math.isfinite(condition.maximum) else math.inf))
+        lows.append(-_floor(-_rounded(condition.minimum * size)))
+        highs.append(_floor(_rounded(condition.maximum * size)))
     return CompiledGate(
         _box_table(boxes),
+        np.array(weights, dtype=np.int32),
         np.array(start, dtype=np.int32),
         np.array(ranks, dtype=np.int32),
         np.array(lows, dtype=np.int64),
@@ -564,8 +601,8 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
     seen = [voxel_box(box, voxel) for group, _ in groups if group.channel != "occupied" for box in group.boxes]
     if volume(_box_table(seen)) > MAX_SEEN_CELLS:
         raise HeadvoxError(
-            f'Cascade {cascade.name}: its "empty" and "hidden" boxes have {volume(_box_table(seen))} cells of {voxel:g} m, '
-            f"more than {MAX_SEEN_CELLS}.",
+            f'Cascade {cascade.name}: its "empty" and "hidden" boxes have {volume(_box_table(seen))} cells of '
+            f"{voxel:g} m, more than {MAX_SEEN_CELLS}.",
             "Make them smaller or fewer, or the voxels larger.",
         )
 

@@ -16,8 +16,8 @@ from headvox.data import F64, Cloud, DepthImage, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import column_bound, gate_columns
-from headvox.integral import integrate
+from headvox.gate import GateTables, gate_columns
+from headvox.integral import VECTOR, integrate
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
 from headvox.refine import MOST_PARTS, fit_spheres, skull_centres
@@ -88,7 +88,7 @@ class Detector:
         clock.done("voxelize")
         S = self._integrate(memory, box)
         clock.done("integral")
-        survivors = self._gate(S, memory)
+        survivors = self._gate(S, box, memory)
         clock.done("gate")
         scores = self._vote(S, survivors, memory)
         clock.done("vote")
@@ -142,18 +142,20 @@ class Detector:
         return box
 
     def _integrate(self, memory: _Memory, box: I64) -> npt.NDArray[Any]:
-        shape = tuple(int(n) for n in box[3:] - box[:3] + 2)
+        nx, ny, nz = (int(n) for n in box[3:] - box[:3] + 2)
+        shape = (nx, ny, -(-nz // VECTOR) * VECTOR)
         S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
         integrate(memory.cells[0], box, self.cascade.source.counting, S)
         return S
 
-    def _gate(self, S: npt.NDArray[Any], memory: _Memory) -> I32:
-        gate, parts, slices = self.cascade.gate, self._threads.count, S.shape[0] - 1
+    def _gate(self, S: npt.NDArray[Any], box: I64, memory: _Memory) -> I32:
+        parts, slices, top = self._threads.count, S.shape[0] - 1, int(box[5] - box[2] + 1)
         found = [0] * parts
 
         def sweep(part: int) -> None:
             low, high = _share(slices, part, parts)
-            arguments = (S, low, high, gate.boxes, gate.start, gate.rank, gate.low, gate.high, memory.least)
+            gate = memory.gates[part]
+            arguments = (S, low, high, top, *gate.tables, *gate.memory(S.shape[2]))
             found[part] = gate_columns(*arguments, memory.survivors[part])
             if found[part] > len(memory.survivors[part]):
                 memory.survivors[part] = np.empty((2 * found[part], 3), np.int32)
@@ -290,9 +292,11 @@ class _Memory:
         self.in_use = False
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
-        self.S = np.empty(math.prod(n + 1 for n in lattice.shape), sum_type)
-        self.index = np.zeros(cells, np.int32)
-        self.least = column_bound(cascade.gate)
+        nx, ny, nz = lattice.shape
+        length = -(-(nz + 1) // VECTOR) * VECTOR
+        self.S = np.empty((nx + 1) * (ny + 1) * length, sum_type)
+        self.index = np.zeros(nx * ny * length, np.int32)
+        self.gates = [GateTables.of(cascade.gate, self.S.dtype, length) for _ in range(threads)]
         self.reach = int(np.abs(cascade.gate.boxes).max(initial=1))
         self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
         self.points = np.empty((MOST_PARTS, 3))

@@ -5,9 +5,9 @@ import pytest
 
 from headvox.data import Intrinsics
 from headvox.synth.camera import IDEAL, Lidar, d435i, kinect, measure, noise_field, sweep, unproject
+from headvox.synth.mounts import camera_pose, lens
 from headvox.synth.rays import View, look
 from headvox.synth.room import box, item
-from headvox.synth.scene import camera_pose, lens
 
 LENS = Intrinsics(320, 240, 215.0, 215.0, 159.5, 119.5)
 CLEAN = replace(IDEAL, baseline_m=0.05)

@@ -20,7 +20,7 @@ from headvox.synth.poses import Pose
 from headvox.synth.room import CELL_M, FloorPlan
 
 if TYPE_CHECKING:
-    from headvox.synth.scene import People
+    from headvox.synth.actors import People
 
 Rng = np.random.Generator
 Mask = npt.NDArray[np.bool_]

@@ -9,20 +9,12 @@ import numpy as np
 
 from headvox.data import F64, Intrinsics
 from headvox.errors import HeadvoxError
+from headvox.synth.actors import Actor, People, animated, place_person, real_people
 from headvox.synth.camera import Sensor, d435i
 from headvox.synth.motion import RATE_HZ, turning
+from headvox.synth.mounts import Camera, camera_pose, lens
 from headvox.synth.room import FloorPlan, rectangle, sample_room
-from headvox.synth.scene import (
-    Actor,
-    Camera,
-    People,
-    Scene,
-    animated,
-    camera_pose,
-    lens,
-    place_person,
-    real_people,
-)
+from headvox.synth.scene import Scene
 
 Rng = np.random.Generator
 

@@ -19,9 +19,10 @@ from PIL import Image
 
 from headvox.data import U16
 from headvox.errors import HeadvoxError
+from headvox.synth.actors import People
 from headvox.synth.camera import d435i
 from headvox.synth.presets import two_cameras
-from headvox.synth.scene import People, Scene, TrueHead
+from headvox.synth.scene import Scene, TrueHead
 
 SAMPLE_FRAMES = 24
 SAMPLE_RATE_HZ = 10.0

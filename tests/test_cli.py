@@ -417,6 +417,17 @@ def test_a_fault_of_headvox_asks_for_a_report(
     assert ("Traceback" in errors) == debug
 
 
+def test_a_place_without_a_cache_is_explained(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(args: object) -> int:
+        raise RuntimeError("cannot cache function 'f': no locator available for file 'gate.py'")
+
+    monkeypatch.setattr(cli, "_warmup", fail)
+    assert cli.main(["warmup"]) == 1
+    assert "Set NUMBA_CACHE_DIR" in capsys.readouterr().err
+
+
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     data=st.binary(max_size=300),

@@ -95,6 +95,11 @@ def _words(error: Exception) -> tuple[str, str]:
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
         return f"error: {name}{error.strerror or error}.", ""
+    if "no locator available" in str(error):  # Numba, in a read-only installation without a home
+        return (
+            "error: there is no folder to keep compiled loops in.",
+            "Set NUMBA_CACHE_DIR to one that can be written.",
+        )
     return (
         f"internal error: {type(error).__name__}: {error}",
         "This is a fault of headvox: please report it, with what the same command prints with --debug.",

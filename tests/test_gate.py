@@ -147,7 +147,10 @@ def test_signed_boxes_in_a_volume_that_wraps_around():
     gate = """
 [[gate]]
 name = "signed"
-boxes = [{ centre = [0, 0, 0], size = [0.3, 0.3, 0.3], weight = 2 }, { centre = [0, 0, 0.2], size = [0.3, 0.3, 0.1], weight = -3 }]
+boxes = [
+  { centre = [0, 0, 0], size = [0.3, 0.3, 0.3], weight = 2 },
+  { centre = [0, 0, 0.2], size = [0.3, 0.3, 0.1], weight = -3 },
+]
 min = 0.1
 max = 0.6
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64
+from headvox.data import F64, U16, Intrinsics
 from headvox.errors import HeadvoxError
 
 RIGID_TOLERANCE = 1e-3  # extrinsics typed by hand have four digits
@@ -48,3 +48,13 @@ def inverse(T_a_b: F64) -> F64:
 def transform(T_a_b: F64, points_b: F64) -> F64:
     """Map (N, 3) points in b to a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def unproject(depth: U16, intrinsics: Intrinsics, T_world_camera: F64) -> F64:
+    """World points (N, 3) of the pixels that have a return, in image order."""
+    v, u = np.nonzero(depth)
+    z = depth[v, u] * intrinsics.depth_scale
+    points = np.stack(
+        [(u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z, z], -1
+    )
+    return transform(T_world_camera, points)

@@ -19,7 +19,7 @@ import numba
 def _source_stamp() -> tuple[str, int]:
     """Return a stamp that changes when any file of the package does."""
     check = 0
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         check = zlib.crc32(path.read_bytes(), check)
     return ("headvox", check)
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from headvox.data import Intrinsics
-from headvox.synth.camera import IDEAL, Lidar, d435i, kinect, measure, noise_field, sweep, unproject
+from headvox.frames import unproject
+from headvox.synth.camera import IDEAL, Lidar, d435i, kinect, measure, noise_field, sweep
 from headvox.synth.mounts import camera_pose, lens
 from headvox.synth.rays import View, look
 from headvox.synth.room import box, item

@@ -10,7 +10,7 @@ import numpy as np
 
 from headvox.data import F64, BadFrame
 from headvox.errors import HeadvoxError
-from headvox.frames import transform
+from headvox.frames import transform, unproject
 from headvox.sources import open_source
 from headvox.sources.cloudfile import CloudFile, CloudFileSource, read_cloud_file
 from headvox.sources.folder import FRAME_NS, FolderSource
@@ -118,8 +118,6 @@ def _tilt(T_world_camera: F64) -> str:
 
 
 def _depth_rows(source: RecordingSource) -> Rows:
-    from headvox.synth.camera import unproject  # here: it brings Numba along
-
     count = len(source.frames)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).astype(int))
     bad = pixels = returns = 0

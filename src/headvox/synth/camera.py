@@ -14,7 +14,6 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from headvox.data import F32, F64, U16, Cloud, Intrinsics
-from headvox.frames import transform
 from headvox.synth.rays import NOTHING, ROOM_ID, Mesh, View, spin
 
 Mask = npt.NDArray[np.bool_]
@@ -370,13 +369,3 @@ def sweep(mesh: Mesh, lidar: Lidar, T_world_sensor: F64, rng: np.random.Generato
     points = np.where(lost[..., None], np.nan, rays * np.where(lost, 0.0, distance)[..., None])
     cloud = Cloud(lidar.name, np.ascontiguousarray(points.reshape(-1, 3), dtype=np.float32), T_world_sensor)
     return cloud, view
-
-
-def unproject(depth: U16, intrinsics: Intrinsics, T_world_camera: F64) -> F64:
-    """World points (N, 3) of the pixels that have a return, in image order."""
-    v, u = np.nonzero(depth)
-    z = depth[v, u] * intrinsics.depth_scale
-    points = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z, z], -1
-    )
-    return transform(T_world_camera, points)

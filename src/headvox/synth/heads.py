@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from multiprocessing import get_context
@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.stats import qmc
 
-from headvox.data import F64
+from headvox.data import F64, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.synth.bodies import (
     I32,
@@ -33,6 +33,8 @@ from headvox.synth.bodies import (
     mean_head_scale,
     mean_height_m,
 )
+from headvox.synth.rays import NOTHING, Mesh, look
+from headvox.synth.spread import escapes, spread_points
 
 EYE_DISTANCE_M = 0.064  # of a normalised head
 RANGES = {"age_years": (8.0, 80.0), "sex": (0.0, 1.0), "mass": (0.15, 0.9), "elongation": (-1.0, 1.0)}
@@ -40,8 +42,9 @@ LONG = {"head-scale-depth-incr": 0.35, "head-back-scale-depth-incr": 0.2, "head-
 ESCAPE_DIRECTIONS = 96
 ESCAPE_SHARE = 0.06  # of the directions that leave a face must go free, or it lies in a fold
 HEADVOX_TO_PAPER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-MAX_SEED = 2**31 - 1  # of Open3D
 TILE_PX = (150, 180)
+TILE_M = 0.34  # wide
+VIEW_FROM_M = 20.0  # far enough for parallel rays
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +105,6 @@ def make_shell(identity: Identity, metric: bool) -> HeadShell:
 
 def seen_from_outside(vertices: F64, faces: I32) -> Mask:
     """Return which faces (F,) can be seen from far away: enough directions that leave one hit nothing."""
-    o3d = _open3d()
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.sqrt((normals * normals).sum(1, keepdims=True)), 1e-12)
@@ -111,42 +113,36 @@ def seen_from_outside(vertices: F64, faces: I32) -> Mask:
     angle = np.pi * (1.0 + np.sqrt(5.0)) * k
     flat = np.sqrt(1.0 - height**2)
     directions = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
-    starts = corners.mean(1) + 2e-4 * normals
-    rays = np.concatenate(np.broadcast_arrays(starts[:, None], directions[None]), axis=-1)
-    blocked = _scene(o3d, vertices, faces).test_occlusions(o3d.core.Tensor(rays.astype(np.float32))).numpy()
-    outward = np.einsum("fa,da->fd", normals, directions) > 0.1
-    return np.asarray((outward & ~blocked).sum(1) >= ESCAPE_SHARE * outward.sum(1))
-
-
-def sample_points(shell: HeadShell, count: int, seed: int) -> F64:
-    """Return ``count`` points (N, 3) spread by Poisson disks over a shell."""
-    o3d = _open3d()
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(shell.vertices), o3d.utility.Vector3iVector(shell.faces)
-    )
-    o3d.utility.random.seed(seed)
-    return np.asarray(mesh.sample_points_poisson_disk(count).points)
+    free = escapes(vertices, faces, corners.mean(1) + 2e-4 * normals, directions)
+    outward = normals @ directions.T > 0.1
+    return np.asarray((outward & free).sum(1) >= ESCAPE_SHARE * outward.sum(1))
 
 
 def make_heads(
-    out: Path, count: int = 44, points: int = 9000, metric: bool = False, seed: int = 0, workers: int = 1
+    out: Path,
+    count: int = 44,
+    points: int = 9000,
+    metric: bool = False,
+    seed: int = 0,
+    workers: int = 1,
+    on_done: Callable[[int], None] | None = None,
 ) -> None:
     """Write ``count`` heads into the folder ``out``.
 
     ``head_00.ply`` is a cloud of ``points`` points, ``head_00_mesh.ply`` its surface; ``manifest.json`` holds
     every head's parameters, centre, eyes and size; ``heads.png`` shows them all. A stopped run goes on where
-    it was, and any number of ``workers`` writes the same bytes.
+    it was, and any number of ``workers`` (processes) writes the same bytes. ``on_done`` is told how many
+    heads there are so far.
 
     Raises:
-        HeadvoxError: a number below one, a negative seed, Open3D missing, or a folder that cannot be made or
-            that holds other heads.
+        HeadvoxError: a number below one, a negative seed, or a folder that cannot be made or that holds other
+            things.
     """
     for name, value in (("count", count), ("points", points), ("workers", workers)):
         if value < 1:
             raise HeadvoxError(f"Expected {name} to be at least 1, got {value}.", "Give a positive number.")
     if seed < 0:
         raise HeadvoxError(f"Expected a seed of 0 or more, got {seed}.", "Give a whole number.")
-    _open3d()
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -158,11 +154,18 @@ def make_heads(
     settings = {"count": count, "points": points, "metric": metric, "seed": seed}
     _claim(out / "settings.json", settings)
     job = partial(_write_head, out=out, points=points, metric=metric, seed=seed)
-    if workers == 1:
-        entries = [job(identity) for identity in identities]
-    else:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            entries = list(pool.map(job, identities))
+    with ExitStack() as stack:
+        if workers == 1:
+            made: Iterable[dict[str, Any]] = map(job, identities)
+        else:
+            spawn = get_context("spawn")
+            pool = stack.enter_context(ProcessPoolExecutor(min(workers, count), mp_context=spawn))
+            made = pool.map(job, identities)
+        entries = []
+        for entry in made:
+            entries.append(entry)
+            if on_done is not None:
+                on_done(len(entries))
     manifest = {
         "format": "headvox-heads",
         "version": 1,
@@ -185,6 +188,10 @@ def _claim(path: Path, settings: dict[str, Any]) -> None:
             f"{path.parent} holds heads with other settings: {path.read_text().strip()}.",
             "Choose an empty folder.",
         )
+    if not path.exists() and any(path.parent.iterdir()):
+        raise HeadvoxError(
+            f"{path.parent} holds other things already.", "Give another name, or remove it first."
+        )
     with _replacing(path) as fresh:
         fresh.write_text(text)
 
@@ -198,9 +205,8 @@ def _write_head(identity: Identity, out: Path, points: int, metric: bool, seed: 
             path.write_bytes(ply_bytes(shell.vertices, shell.faces))
     if not cloud.exists():
         with _replacing(cloud) as path:
-            path.write_bytes(
-                ply_bytes(sample_points(shell, points, (seed * 100_003 + identity.number) % MAX_SEED))
-            )
+            rng = np.random.default_rng([seed, identity.number])
+            path.write_bytes(ply_bytes(spread_points(shell.vertices, shell.faces, points, rng)))
     size = np.ptp(shell.vertices, axis=0)
     return {
         **asdict(identity),
@@ -252,36 +258,17 @@ def _contact_sheet(path: Path, shells: list[HeadShell]) -> None:
 
 
 def _picture(shell: HeadShell) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Return a shaded view (height, width) from the front left, 0.34 m wide."""
-    o3d = _open3d()
+    """Return a shaded view (height, width) from the front left."""
     width, height = TILE_PX
     turn = np.radians(30.0)
-    toward = np.array([-np.sin(turn), np.cos(turn), 0.15])
-    toward /= np.sqrt((toward * toward).sum())
+    backward = np.array([np.sin(turn), -np.cos(turn), -0.15])
+    backward /= np.sqrt((backward * backward).sum())
     right = np.array([-np.cos(turn), -np.sin(turn), 0.0])
-    up = np.cross(right, -toward)
-    pixel = 0.34 / width
-    columns, rows = np.meshgrid(np.arange(width) + 0.5 - width / 2, height / 2 - np.arange(height) - 0.5)
-    starts = toward + pixel * (columns[..., None] * right + rows[..., None] * up)
-    rays = np.concatenate([starts, np.broadcast_to(-toward, starts.shape)], axis=-1)
-    seen = _scene(o3d, shell.vertices, shell.faces).cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
-    shade = np.abs(seen["primitive_normals"].numpy() @ toward)
-    return np.where(np.isfinite(seen["t_hit"].numpy()), 40 + 190 * shade, 255).astype(np.uint8)
-
-
-def _scene(o3d: Any, vertices: F64, faces: I32) -> Any:
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-    )
-    return scene
-
-
-def _open3d() -> Any:
-    try:
-        import open3d
-    except ImportError:
-        raise HeadvoxError(
-            "Making the heads data set needs Open3D.", 'Install it with: pip install "headvox[synth]"'
-        ) from None
-    return open3d
+    T_head_camera = np.eye(4)
+    T_head_camera[:3, :3] = np.column_stack([right, np.cross(backward, right), backward])
+    T_head_camera[:3, 3] = -VIEW_FROM_M * backward
+    focal = VIEW_FROM_M * width / TILE_M
+    lens = Intrinsics(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+    plain = np.ones(len(shell.faces), np.float32)
+    view = look(Mesh(shell.vertices, shell.faces, plain, np.zeros(len(plain), np.int32)), lens, T_head_camera)
+    return np.where(view.ids != NOTHING, 40 + 190 * view.cosine, 255).astype(np.uint8)

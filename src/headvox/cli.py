@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 GOOD, KNOWN_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 # Commands that read their own flags: `headvox NAME ...` is main([...]) of a module, which returns the code.
-MODULES = {"bench": ("headvox.bench", "measure how fast it is here")}
+MODULES = {
+    "synth": ("headvox.synth.command", "make heads, people and recordings with known truth"),
+    "bench": ("headvox.bench", "measure how fast it is here"),
+}
 
 DESCRIPTION = (
     "Find human heads in 3-D, in real time, in point clouds and depth images, without a neural network."

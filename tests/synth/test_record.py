@@ -78,6 +78,7 @@ def test_a_recording_that_was_broken_off_goes_on(tmp_path, scene, monkeypatch):
 
 def test_what_cannot_be_written_is_said(tmp_path, scene):
     (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "mine.txt").write_text("mine")
     with pytest.raises(HeadvoxError, match="exists already"):
         record.write_recording(tmp_path / "there", scene, STAMPS)
     with pytest.raises(HeadvoxError, match="later than the one before"):

@@ -9,12 +9,10 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +31,7 @@ from headvox.synth.bodies import (
     mean_head_scale,
     mean_height_m,
 )
+from headvox.synth.processes import in_processes
 from headvox.synth.rays import NOTHING, Mesh, look
 from headvox.synth.spread import escapes, spread_points
 
@@ -154,18 +153,11 @@ def make_heads(
     settings = {"count": count, "points": points, "metric": metric, "seed": seed}
     _claim(out / "settings.json", settings)
     job = partial(_write_head, out=out, points=points, metric=metric, seed=seed)
-    with ExitStack() as stack:
-        if workers == 1:
-            made: Iterable[dict[str, Any]] = map(job, identities)
-        else:
-            spawn = get_context("spawn")
-            pool = stack.enter_context(ProcessPoolExecutor(min(workers, count), mp_context=spawn))
-            made = pool.map(job, identities)
-        entries = []
-        for entry in made:
-            entries.append(entry)
-            if on_done is not None:
-                on_done(len(entries))
+    entries = []
+    for entry in in_processes(job, identities, workers):
+        entries.append(entry)
+        if on_done is not None:
+            on_done(len(entries))
     manifest = {
         "format": "headvox-heads",
         "version": 1,

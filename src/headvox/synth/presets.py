@@ -6,15 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from headvox.data import F64, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.synth.actors import Actor, People, animated, place_person, real_people
-from headvox.synth.camera import Sensor, d435i
+from headvox.synth.camera import IDEAL, Lidar, Sensor, d435i
 from headvox.synth.motion import RATE_HZ, turning
-from headvox.synth.mounts import Camera, camera_pose, lens
+from headvox.synth.mounts import Camera, PlacedLidar, camera_pose, lens
 from headvox.synth.room import FloorPlan, rectangle, sample_room
-from headvox.synth.scene import Scene
+from headvox.synth.scene import POSTURE_SHARES, POSTURES, Scene, sample_scene
 
 Rng = np.random.Generator
 
@@ -24,25 +25,44 @@ PAPER_TURN_RAD_S = float(np.radians(12.0))
 TRIES = 30
 
 
-def walk(seed: int = 0, people: People | None = None, duration_s: float = 10.0) -> Scene:
-    """One person walks about in front of one D435i."""
-    return _staged(seed, people, ("walking",), ("walk",), _front_camera(), duration_s)
+def walk(
+    seed: int = 0,
+    people: People | None = None,
+    duration_s: float = 10.0,
+    mode: str = "d435i",
+    sensor: Sensor | None = None,
+) -> Scene:
+    """One person walks about in front of one D435i, or of another camera (see :func:`.mounts.lens`)."""
+    return _staged(seed, people, ("walking",), ("walk",), _front_camera(mode, sensor), duration_s)
 
 
-def turn(seed: int = 0, people: People | None = None, duration_s: float = 30.0) -> Scene:
-    """One person turns on the spot by 12 degrees a second, the paper's pace, in front of one D435i."""
-    scene = _staged(seed, people, ("standing",), ("stay",), _front_camera(), 0.0, (0.6, 0.4))
+def turn(
+    seed: int = 0,
+    people: People | None = None,
+    duration_s: float = 30.0,
+    mode: str = "d435i",
+    sensor: Sensor | None = None,
+) -> Scene:
+    """One person turns on the spot by 12 degrees a second, the paper's pace, in front of one camera."""
+    scene = _staged(seed, people, ("standing",), ("stay",), _front_camera(mode, sensor), 0.0, (0.6, 0.4))
     actor = scene.actors[0]
     moments = turning(actor.moments[0], round(duration_s * RATE_HZ), PAPER_TURN_RAD_S)
     scene.actors = [replace(actor, moments=moments)]
     return scene
 
 
-def crowd(seed: int = 0, people: People | None = None, duration_s: float = 10.0) -> Scene:
-    """Six people in front of one D435i: three walk, one sits, one turns, one stands."""
+def crowd(
+    seed: int = 0,
+    people: People | None = None,
+    duration_s: float = 10.0,
+    mode: str = "d435i",
+    sensor: Sensor | None = None,
+) -> Scene:
+    """Six people in front of one camera: three walk, one sits, one turns, one stands."""
     postures = ("walking", "walking", "walking", "sitting", "standing", "standing")
     acts = ("walk", "walk", "walk", "rise", "turn", "stay")
-    return _staged(seed, people, postures, acts, _front_camera(), duration_s, (2.2, 1.6), clutter=0.15)
+    rig = _front_camera(mode, sensor)
+    return _staged(seed, people, postures, acts, rig, duration_s, (2.2, 1.6), clutter=0.15)
 
 
 def two_cameras(
@@ -70,8 +90,59 @@ def _camera(
     return Camera(name, intrinsics, camera_pose(xyz, yaw_rad, 0.12), sensor)
 
 
-def _front_camera() -> list[Camera]:
-    return [_camera("front", lens("d435i"), d435i(), (-2.6, 0.0, 1.3), 0.0)]
+def _front_camera(mode: str, sensor: Sensor | None) -> list[Camera]:
+    return [_camera("front", lens(mode), sensor or d435i(), (-2.6, 0.0, 1.3), 0.0)]
+
+
+def room(
+    seed: int = 0,
+    people: People | None = None,
+    duration_s: float = 10.0,
+    count: int = 3,
+    cameras: int = 1,
+    device: tuple[Intrinsics, Sensor] | None = None,
+) -> Scene:
+    """``count`` people in a random room with things that look like heads, and cameras wherever.
+
+    Somebody is seen at the start, if there is anybody; ``device`` None gives each camera its own sort.
+    """
+
+    def furnished(rng: Rng) -> Scene:
+        postures = [str(name) for name in rng.choice(POSTURES, count, p=POSTURE_SHARES)]
+        return sample_scene(rng, people, postures, cameras, True, duration_s, device)
+
+    return _peopled(seed, count, furnished)
+
+
+def lidar(
+    seed: int = 0, people: People | None = None, duration_s: float = 10.0, count: int = 3, rings: int = 32
+) -> Scene:
+    """The same as :func:`room`, seen by one spinning LiDAR."""
+
+    def furnished(rng: Rng) -> Scene:
+        postures = [str(name) for name in rng.choice(POSTURES, count, p=POSTURE_SHARES)]
+        scene = sample_scene(rng, people, postures, 1, True, duration_s, (lens("kinect"), IDEAL))
+        T_world_sensor = np.eye(4)
+        T_world_sensor[:3, 3] = scene.cameras[0].T_world_camera[:3, 3]
+        T_world_sensor[:3, :3] = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_matrix()
+        return replace(scene, cameras=[], lidars=[PlacedLidar(Lidar(rings=rings), T_world_sensor)])
+
+    return _peopled(seed, count, furnished)
+
+
+def _peopled(seed: int, count: int, furnished: Callable[[Rng], Scene]) -> Scene:
+    """The first scene with all of ``count`` people in it, somebody of whom is seen at the start."""
+    for attempt in range(TRIES):
+        scene = furnished(np.random.default_rng([seed, attempt, 0x40031]))
+        if len(scene.actors) == count and (count == 0 or _shows_somebody(scene)):
+            return scene
+    raise HeadvoxError(
+        f"Expected space for {count} people, got none in {TRIES} rooms.", "Take fewer people or another seed."
+    )
+
+
+def _shows_somebody(scene: Scene) -> bool:
+    return any(not head.ignore for head in scene.frame(0)[1])
 
 
 def _staged(
@@ -138,4 +209,6 @@ PRESETS: dict[str, Callable[..., Scene]] = {
     "turn": turn,
     "crowd": crowd,
     "two_cameras": two_cameras,
+    "room": room,
+    "lidar": lidar,
 }

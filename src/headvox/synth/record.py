@@ -6,22 +6,28 @@ recording that was broken off goes on where it stopped.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
-from headvox.data import U16
+from headvox import __version__
+from headvox.data import U16, Cloud, Frame
 from headvox.errors import HeadvoxError
+from headvox.sources.folder import FRAME_NS
 from headvox.synth.actors import People
 from headvox.synth.camera import d435i
 from headvox.synth.presets import two_cameras
+from headvox.synth.processes import in_processes
 from headvox.synth.scene import Scene, TrueHead
 
 SAMPLE_FRAMES = 24
@@ -33,78 +39,159 @@ def stamps(count: int, rate_hz: float = 10.0) -> list[int]:
     return [round(k * 1e9 / rate_hz) for k in range(count)]
 
 
-def write_recording(folder: str | Path, scene: Scene, stamps_ns: Sequence[int], workers: int = 1) -> Path:
+def cloud_stamps(count: int) -> list[int]:
+    """Stamps [ns] that a folder of clouds is read with: files have none."""
+    return [k * FRAME_NS for k in range(count)]
+
+
+def write_recording(
+    folder: str | Path,
+    scene: Scene,
+    stamps_ns: Sequence[int],
+    workers: int = 1,
+    on_done: Callable[[int], None] | None = None,
+) -> Path:
     """Write the frames of a scene at ``stamps_ns`` and ``heads.jsonl``; return the folder.
 
-    The bytes are the same for any number of ``workers`` (threads).
+    The bytes are the same for any number of ``workers`` (processes). ``on_done`` is told how many frames
+    there are so far.
 
     Raises:
-        HeadvoxError: the folder exists, no camera, a LiDAR in the scene, stamps that do not rise, or another
-            recording was begun under this name.
+        HeadvoxError: the folder holds something, no camera, a LiDAR in the scene, stamps that do not rise, or
+            another recording was begun under this name.
     """
-    folder = Path(folder)
-    _check(folder, scene, stamps_ns, workers)
-    description = json.dumps(_description(scene, stamps_ns), indent=1) + "\n"
-    partial = folder.with_name(folder.name + ".partial")
-    _begin(partial, {"seed": scene.seed, "recording": description})
-    truth = partial / "truth"
-    for place in (truth, *(partial / camera.name for camera in scene.cameras)):
-        place.mkdir(exist_ok=True)
-    with ThreadPoolExecutor(workers, "headvox-record") as pool:
-        jobs = [pool.submit(_write_frame, partial, scene, k, stamp) for k, stamp in enumerate(stamps_ns)]
-        try:
-            for job in jobs:
-                job.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    lines = [truth / f"{k:06d}.json" for k in range(len(stamps_ns))]
-    _write_text(partial / "heads.jsonl", "".join(line.read_text(encoding="utf-8") for line in lines))
-    _write_text(partial / "recording.json", description)
-    for line in lines:
-        line.unlink()
-    truth.rmdir()
-    (partial / "making.json").unlink()
-    partial.rename(folder)
-    return folder
-
-
-def _check(folder: Path, scene: Scene, stamps_ns: Sequence[int], workers: int) -> None:
-    if folder.exists():
-        raise HeadvoxError(f"{folder} exists already.", "Give another name, or remove it first.")
     if not scene.cameras or scene.lidars:
         got = f"{len(scene.cameras)} cameras and {len(scene.lidars)} LiDARs"
         raise HeadvoxError(
             f"A depth recording holds depth cameras only, got {got}.", "Change the scene's sensors."
         )
+    description = json.dumps(_description(scene, stamps_ns), indent=1) + "\n"
+    return _write(Path(folder), scene, stamps_ns, workers, on_done, _write_depths, description)
+
+
+def write_clouds(
+    folder: str | Path,
+    scene: Scene,
+    stamps_ns: Sequence[int],
+    workers: int = 1,
+    on_done: Callable[[int], None] | None = None,
+) -> Path:
+    """Write what the one LiDAR of a scene sees as PCD files, and ``heads.jsonl``; return the folder.
+
+    The clouds are in the sensor's frame, and VIEWPOINT says where it is. Everything else is as in
+    :func:`write_recording`; see :func:`cloud_stamps`.
+    """
+    if scene.cameras or len(scene.lidars) != 1:
+        got = f"{len(scene.cameras)} cameras and {len(scene.lidars)} LiDARs"
+        raise HeadvoxError(f"A folder of clouds holds one LiDAR's, got {got}.", "Change the scene's sensors.")
+    return _write(Path(folder), scene, stamps_ns, workers, on_done, _write_cloud, None)
+
+
+def _write(
+    folder: Path,
+    scene: Scene,
+    stamps_ns: Sequence[int],
+    workers: int,
+    on_done: Callable[[int], None] | None,
+    write_frame: Callable[[Path, Frame, int], None],
+    description: str | None,
+) -> Path:
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise HeadvoxError(f"{folder} exists already.", "Give another name, or remove it first.")
     if not stamps_ns or any(b <= a for a, b in pairwise(stamps_ns)):
         raise HeadvoxError("Expected at least one stamp, each later than the one before.", "Sort the stamps.")
     if workers < 1:
         raise HeadvoxError(f"Expected at least 1 worker, got {workers}.", "Give a whole number from 1 on.")
+    partial_folder = folder.with_name(folder.name + ".partial")
+    _begin(partial_folder, _making(scene, stamps_ns))
+    truth = partial_folder / "truth"
+    for place in (truth, *(partial_folder / camera.name for camera in scene.cameras)):
+        place.mkdir(exist_ok=True)
+    job = partial(_make_frame, folder=partial_folder, scene=scene, write_frame=write_frame)
+    lines = []
+    for line in in_processes(job, list(enumerate(stamps_ns)), workers):
+        lines.append(line)
+        if on_done is not None:
+            on_done(len(lines))
+    _write_text(partial_folder / "heads.jsonl", "".join(line.read_text(encoding="utf-8") for line in lines))
+    if description is not None:
+        _write_text(partial_folder / "recording.json", description)
+    for line in lines:
+        line.unlink()
+    truth.rmdir()
+    (partial_folder / "making.json").unlink()
+    if folder.exists():
+        folder.rmdir()  # it is empty
+    partial_folder.rename(folder)
+    return folder
 
 
-def _begin(partial: Path, making: dict[str, Any]) -> None:
+def _making(scene: Scene, stamps_ns: Sequence[int]) -> dict[str, Any]:
+    """What a recording that goes on must have in common with the one that was begun."""
+    people = [
+        (actor.id, actor.moments[0].pose.posture, actor.moments[0].xy, len(actor.moments))
+        for actor in scene.actors
+    ]
+    sensors = [repr(camera) for camera in scene.cameras] + [repr(lidar) for lidar in scene.lidars]
+    made = json.dumps([people, sensors, list(stamps_ns)])
+    return {
+        "version": __version__,
+        "seed": scene.seed,
+        "scene": hashlib.sha256(made.encode()).hexdigest(),
+    }
+
+
+def _begin(folder: Path, making: dict[str, Any]) -> None:
     """Make the folder, or go on with it when the same recording was begun there."""
-    note = partial / "making.json"
-    partial.mkdir(parents=True, exist_ok=True)
-    if not note.exists():
+    note = folder / "making.json"
+    folder.mkdir(parents=True, exist_ok=True)
+    if not note.exists() and not any(folder.iterdir()):
         _write_text(note, json.dumps(making))
-    elif json.loads(note.read_text(encoding="utf-8")) != making:
+    elif not note.exists() or json.loads(note.read_text(encoding="utf-8")) != making:
         raise HeadvoxError(
-            f"{partial} holds the beginning of another recording.", "Remove it, or give another name."
+            f"{folder} holds the beginning of another recording.", "Remove it, or give another name."
         )
 
 
-def _write_frame(partial: Path, scene: Scene, number: int, stamp_ns: int) -> None:
-    line = partial / "truth" / f"{number:06d}.json"
+def _make_frame(
+    which: tuple[int, int], folder: Path, scene: Scene, write_frame: Callable[[Path, Frame, int], None]
+) -> Path:
+    number, stamp_ns = which
+    line = folder / "truth" / f"{number:06d}.json"
     if line.exists():  # written last: its images are there too
-        return
+        return line
     frame, heads = scene.frame(stamp_ns)
-    for depth in frame.depths:
-        _write_png(partial / depth.name / f"{number:06d}.png", depth.depth)
+    write_frame(folder, frame, number)
     _write_text(
         line, json.dumps({"stamp_ns": stamp_ns, "heads": [_row(h) for h in heads], "exhaustive": True}) + "\n"
     )
+    return line
+
+
+def _write_depths(folder: Path, frame: Frame, number: int) -> None:
+    for depth in frame.depths:
+        _write_png(folder / depth.name / f"{number:06d}.png", depth.depth)
+
+
+def _write_cloud(folder: Path, frame: Frame, number: int) -> None:
+    (cloud,) = frame.clouds
+    path = folder / f"{number:06d}.pcd"
+    unfinished = path.with_suffix(".part")
+    unfinished.write_bytes(pcd_bytes(cloud))
+    os.replace(unfinished, path)
+
+
+def pcd_bytes(cloud: Cloud) -> bytes:
+    """Return a binary PCD file; the sensor's place becomes its VIEWPOINT."""
+    T_world_sensor = np.eye(4) if cloud.T_world_sensor is None else cloud.T_world_sensor
+    x, y, z, w = Rotation.from_matrix(T_world_sensor[:3, :3]).as_quat()
+    place = [f"{n:.9g}" for n in (*T_world_sensor[:3, 3], w, x, y, z)]
+    count = len(cloud.points)
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
+        f"COUNT 1 1 1\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT {' '.join(place)}\nPOINTS {count}\nDATA binary\n"
+    )
+    return header.encode("ascii") + cloud.points.astype("<f4").tobytes()
 
 
 def _row(head: TrueHead) -> dict[str, Any]:
@@ -158,6 +245,12 @@ def sample_scene_of_three(seed: int = 0, people: People | None = None) -> Scene:
     )
 
 
-def make_sample(out: str | Path, people: People | None = None) -> Path:
+def make_sample(
+    out: str | Path,
+    people: People | None = None,
+    workers: int = 1,
+    on_done: Callable[[int], None] | None = None,
+) -> Path:
     """Write the small two-camera recording that comes with the package: 24 frames, under 3.5 MB."""
-    return write_recording(out, sample_scene_of_three(people=people), stamps(SAMPLE_FRAMES, SAMPLE_RATE_HZ))
+    scene = sample_scene_of_three(people=people)
+    return write_recording(out, scene, stamps(SAMPLE_FRAMES, SAMPLE_RATE_HZ), workers, on_done)

@@ -8,7 +8,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from headvox.data import F32, F64, U16, Cloud, DepthImage, Frame, Intrinsics
 from headvox.frames import inverse, transform
 from headvox.synth.actors import Actor, People, animated, place_person, real_people
-from headvox.synth.camera import measure, sweep
+from headvox.synth.camera import Sensor, measure, sweep
 from headvox.synth.motion import sample_act
 from headvox.synth.mounts import Camera, PlacedLidar, sample_camera_pose, sample_device
 from headvox.synth.rays import NEAR_M, Mesh, View, join, look, spin
@@ -102,6 +104,20 @@ class Scene:
         things += [_dummy(dummy, DUMMY_IDS_FROM + k).mesh for k, dummy in enumerate(self.room.dummies)]
         mesh = join([self._still(), *things])
         return [look(mesh, camera.intrinsics, camera.T_world_camera) for camera in self.cameras]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Let a scene go to other processes: a module of people goes by its name."""
+        state = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        if isinstance(self.people, ModuleType):
+            state["people"] = self.people.__name__
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Come back from :meth:`__getstate__`."""
+        for name, value in state.items():
+            setattr(
+                self, name, import_module(value) if name == "people" and isinstance(value, str) else value
+            )
 
     def _still(self) -> Mesh:
         if self._room_mesh is None:
@@ -204,11 +220,13 @@ def sample_scene(
     cameras: int | None = None,
     moving: bool = True,
     duration_s: float = 10.0,
+    device: tuple[Intrinsics, Sensor] | None = None,
 ) -> Scene:
     """A random room with people and cameras.
 
     ``postures`` has one entry a person (0-5 random ones by default); when ``moving``, those "walking" walk
-    about and all look around. ``cameras`` is 1-4, mostly 1 by default.
+    about and all look around. ``cameras`` is 1-4, mostly 1 by default; each is another sort of camera unless
+    ``device`` says which.
     """
     people = real_people() if people is None else people
     room = sample_room(rng)
@@ -228,7 +246,7 @@ def sample_scene(
     count = int(rng.choice([1, 2, 3, 4], p=[0.8, 0.12, 0.05, 0.03])) if cameras is None else cameras
     rig = []
     for k in range(count):
-        intrinsics, sensor = sample_device(rng)
+        intrinsics, sensor = sample_device(rng) if device is None else device
         rig.append(
             Camera(f"camera_{k}", intrinsics, sample_camera_pose(rng, room, targets, intrinsics), sensor)
         )

@@ -13,51 +13,45 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.integral import Integral
+from headvox.integral import VECTOR, Integral
 from headvox.kernels import kernel, rule
 from headvox.masks import CompiledGate
 
-I16_OR_I32 = npt.NDArray[Any]
-
 
 @rule
-def _column_sums(S, x, y, box, weight, pad, edge, out, adding):  # type: ignore[no-untyped-def]
-    """Write to ``out``, or add to it, the weighted sums over ``box`` about every voxel of the column x, y."""
-    nx, ny, n = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
+def _column_sums(S, x, y, box, weight, bottom, out, adding):  # type: ignore[no-untyped-def]
+    """Write to ``out``, or add to it, the weighted sums over ``box`` about the voxels of a column, from ``bottom`` up.
+
+    In x and y the box is cut off at the edges of S; in z it has to lie within S.
+    """
+    nx, ny, length = S.shape[0] - 1, S.shape[1] - 1, out.shape[0]
     x0, x1 = min(max(x + box[0], 0), nx), min(max(x + box[1], 0), nx)
     y0, y1 = min(max(y + box[2], 0), ny), min(max(y + box[3], 0), ny)
-    a, b, c, d = S[x1, y1], S[x0, y1], S[x1, y0], S[x0, y0]
-    middle = edge[pad : pad + n]
-    for z in range(n):
-        middle[z] = (a[z] - b[z]) - (c[z] - d[z])
-    top = middle[n - 1]
-    above = edge[pad + n :]
-    for z in range(pad):
-        above[z] = top
-    low = edge[pad + box[4] : pad + box[4] + n]
-    high = edge[pad + box[5] : pad + box[5] + n]
+    low, high = bottom + box[4], bottom + box[5]
+    a, b = S[x1, y1, high : high + length], S[x0, y1, high : high + length]
+    c, d = S[x1, y0, high : high + length], S[x0, y0, high : high + length]
+    e, f = S[x1, y1, low : low + length], S[x0, y1, low : low + length]
+    g, h = S[x1, y0, low : low + length], S[x0, y0, low : low + length]
     if adding:
-        for z in range(n):
-            out[z] += weight * (high[z] - low[z])
+        for z in range(length):
+            out[z] += weight * (((a[z] - b[z]) - (c[z] - d[z])) - ((e[z] - f[z]) - (g[z] - h[z])))
     else:
-        for z in range(n):
-            out[z] = weight * (high[z] - low[z])
+        for z in range(length):
+            out[z] = weight * (((a[z] - b[z]) - (c[z] - d[z])) - ((e[z] - f[z]) - (g[z] - h[z])))
 
 
 @kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S, first, last, top, boxes, weights, start, rank, limits, least, edge, sums, alive, survivors
+    S, first, last, bottom, top, boxes, weights, start, rank, limits, least, sums, alive, survivors
 ):
     """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many there are.
 
-    Only voxels below ``top`` count; S may be longer, so that a column is a whole number of vectors. ``least`` is x0 x1
-    y0 y1 and a count: a window that holds fewer in the whole column cannot pass, whatever z. ``edge``, ``sums`` and
-    ``alive`` are working memory. Counting goes on past the end of ``survivors``, so that the caller can tell how many
-    did not fit.
+    Only voxels from ``bottom`` to ``top`` count; about them, no box may leave S in z. ``least`` is x0 x1 y0 y1 and a
+    count: a window that holds fewer in the whole column cannot pass, whatever z. ``sums`` and ``alive``, a whole number
+    of vectors long, are working memory. Counting goes on past the end of ``survivors``, so that the caller can tell
+    how many did not fit.
     """
     nx, ny, n = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
-    pad = (edge.shape[0] - n) // 2
-    edge[:pad] = 0
     found = 0
     # A whole column may wrap around where no box does; a voxel has 8 parts at most.
     fits = S.itemsize > 2 or (least[1] - least[0]) * (least[3] - least[2]) * n * 8 <= 0xFFFF
@@ -74,22 +68,22 @@ def gate_columns(  # type: ignore[no-untyped-def]
                 begin, count = start[i], start[i + 1] - start[i]
                 if rank[i] == 0:
                     for k in range(count):
-                        _column_sums(S, x, y, boxes[begin + k], weights[begin + k], pad, edge, sums[0], k > 0)
+                        _column_sums(S, x, y, boxes[begin + k], weights[begin + k], bottom, sums[0], k > 0)
                     any_alive = _within(sums[0], limits[i, 0], limits[i, 1], alive)
                 else:
                     for k in range(count):
-                        _column_sums(S, x, y, boxes[begin + k], 1, pad, edge, sums[k], False)
+                        _column_sums(S, x, y, boxes[begin + k], 1, bottom, sums[k], False)
                     _sort(sums, count, rank[i])
                     any_alive = _within(sums[rank[i] - 1], limits[i, 0], limits[i, 1], alive)
                 if not any_alive:
                     break
             if any_alive:
-                for z in range(top):
+                for z in range(top - bottom):
                     if alive[z]:
                         if found < survivors.shape[0]:
                             survivors[found, 0] = x
                             survivors[found, 1] = y
-                            survivors[found, 2] = z
+                            survivors[found, 2] = bottom + z
                         found += 1
     return found
 
@@ -139,43 +133,55 @@ def column_bound(gate: CompiledGate) -> npt.NDArray[np.int64]:
     return best
 
 
+def margins(gate: CompiledGate) -> tuple[int, int]:
+    """Return how many voxels below and above a candidate the boxes of ``gate`` reach."""
+    return int(max(-gate.boxes[:, 4].min(initial=0), 0)), int(max(gate.boxes[:, 5].max(initial=0), 0))
+
+
+def padded(height: int) -> int:
+    """Return the least whole number of vectors that holds ``height`` voxels."""
+    return -(-height // VECTOR) * VECTOR
+
+
 @dataclass(frozen=True, slots=True)
 class GateTables:
     """A gate for one type of integral volume, and the working memory of one thread."""
 
     tables: tuple[npt.NDArray[Any], ...]
     """Boxes, weights, starts, ranks, limits in the type of the sums, and the column bound."""
-    edge: npt.NDArray[Any]
-    sums: I16_OR_I32
-    """Flat: :meth:`memory` cuts it to the length of the columns."""
+    sums: npt.NDArray[Any]
+    """Flat: :meth:`memory` cuts it to the height of the columns."""
     alive: npt.NDArray[np.uint8]
 
     @classmethod
-    def of(cls, gate: CompiledGate, sum_type: np.dtype[Any], length: int) -> GateTables:
-        """Return the tables for an integral volume of ``sum_type`` whose columns are ``length`` long."""
+    def of(cls, gate: CompiledGate, sum_type: np.dtype[Any], height: int) -> GateTables:
+        """Return the tables for an integral volume of ``sum_type`` and candidates in columns up to ``height``."""
         signed = np.dtype(f"i{sum_type.itemsize}")
         most = int(np.diff(gate.start).max(initial=1))
-        reach = int(np.abs(gate.boxes[:, 4:]).max(initial=0))
         least, greatest = np.iinfo(signed).min, np.iinfo(signed).max
         limits = np.clip(np.stack([gate.low, gate.high], axis=1), least, greatest).astype(signed)
         return cls(
             (gate.boxes, gate.weights, gate.start, gate.rank, limits, column_bound(gate)),
-            np.zeros(length + 2 * reach, sum_type),
-            np.empty(most * length, signed),
-            np.empty(length, np.uint8),
+            np.empty(most * padded(height), signed),
+            np.empty(padded(height), np.uint8),
         )
 
-    def memory(self, length: int) -> tuple[npt.NDArray[Any], ...]:
-        """Return edge, sums and alive for columns of ``length``, at most the length they were made for."""
-        spare, most = len(self.edge) - len(self.alive), len(self.sums) // len(self.alive)
-        return self.edge[: length + spare], self.sums[: most * length].reshape(most, length), self.alive[:length]
+    def memory(self, height: int) -> tuple[npt.NDArray[Any], ...]:
+        """Return sums and alive for columns of ``height``, at most the height they were made for."""
+        most, length = len(self.sums) // len(self.alive), padded(height)
+        return self.sums[: most * length].reshape(most, length), self.alive[:length]
 
 
 def pass_gate(S: Integral, gate: CompiledGate) -> npt.NDArray[np.int32]:
     """Return the voxels (n, 3) of the integral volume ``S`` that pass, in the order of x, y, z."""
-    tables = GateTables.of(gate, S.dtype, S.shape[2])
-    arguments = (S, 0, S.shape[0] - 1, S.shape[2] - 1, *tables.tables, *tables.memory(S.shape[2]))
+    below, above = margins(gate)
+    height = S.shape[2] - 1
+    longer = np.pad(S, ((0, 0), (0, 0), (below, padded(height) - height + above)), mode="edge")
+    longer[:, :, :below] = 0
+    tables = GateTables.of(gate, S.dtype, height)
+    arguments = (longer, 0, S.shape[0] - 1, below, below + height, *tables.tables, *tables.memory(height))
     count = gate_columns(*arguments, np.empty((0, 3), np.int32))
     survivors = np.empty((count, 3), np.int32)
     gate_columns(*arguments, survivors)
+    survivors[:, 2] -= below
     return survivors

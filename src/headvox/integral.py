@@ -19,7 +19,7 @@ import numpy.typing as npt
 from headvox.kernels import kernel, rule
 
 VECTOR = 32
-"""A column of an integral volume in steady use is a whole number of vectors of this many sums."""
+"""The gate works on whole vectors of this many sums."""
 
 PARTS = np.array([value.bit_count() for value in range(256)], dtype=np.uint8)
 
@@ -30,25 +30,32 @@ Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
 def integrate(cells, box, counting, S):  # type: ignore[no-untyped-def]
     """Fill ``S`` (bx+1, by+1, bz+1 or longer) with the integral volume of the cells in ``box``.
 
-    ``box`` is lowest and highest cell (inclusive) of the grid ``cells``. A parts grid is summed by its bits. Where S is
-    longer than the box, as if empty cells went on above it.
+    ``box`` is lowest and highest cell (inclusive). In z it may begin below the grid, and S may be longer: the cells
+    there are taken for empty. A parts grid is summed by its bits.
     """
     x0, y0, z0 = box[0], box[1], box[2]
     nx, ny, length = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
-    nz = min(box[5] - box[2] + 1, length - 1)
+    first = max(-z0, 0)
+    nz = min(min(box[5] + 1, cells.shape[2]) - (z0 + first), length - 1 - first)
     row = np.empty(length, S.dtype)
     S[0] = 0
     for x in range(nx):
         row[:] = 0
         S[x + 1, 0] = 0
         for y in range(ny):
-            column = cells[x0 + x, y0 + y, z0 : z0 + nz]
+            column = cells[x0 + x, y0 + y, z0 + first : z0 + first + nz]
             if _any(column):
+                sums = row[first + 1 : first + 1 + nz]
                 total = 0
-                for z in range(nz):
-                    total += column[z] if counting else PARTS[column[z] & 255]
-                    row[z + 1] += total
-                row[nz + 1 :] = row[nz]
+                if counting:
+                    for z in range(nz):
+                        total += column[z]
+                        sums[z] += total
+                else:
+                    for z in range(nz):
+                        total += PARTS[column[z] & 255]
+                        sums[z] += total
+                row[first + 1 + nz :] = row[first + nz]
             below = S[x, y + 1]
             out = S[x + 1, y + 1]
             for z in range(length):

@@ -16,15 +16,15 @@ from headvox.data import F64, Cloud, DepthImage, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import GateTables, gate_columns
-from headvox.integral import VECTOR, integrate
+from headvox.gate import GateTables, gate_columns, margins, padded
+from headvox.integral import integrate
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
 from headvox.refine import MOST_PARTS, fit_spheres, skull_centres
 from headvox.suppress import local_maxima, suppress_overlaps
 from headvox.visibility import camera_table, cells_of, count_states, look_about
 from headvox.vote import DROPPED, feature_count, seen_boxes, stage_tables, vote_masks, vote_stages
-from headvox.voxelize import Lattice, Rays, clear, mark_depth, mark_points, merge, new_box, part_transform
+from headvox.voxelize import Lattice, Rays, clear, mark_depth, mark_points, merge, new_span, occupied_box, part_transform
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
@@ -94,9 +94,9 @@ class Detector:
         clock.done("vote")
         peaks = self._suppress(S, survivors, scores, memory)
         clock.done("suppress")
-        peaks, scores = self._judge(frame, S, survivors, scores, peaks, box, memory)
+        peaks, scores = self._judge(frame, S, survivors, scores, peaks, memory)
         clock.done("judge")
-        heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, box, memory)
+        heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, memory)
         clock.done("refine")
         clear(memory.cells[0], box)
         memory.in_use = False
@@ -111,51 +111,56 @@ class Detector:
     def _voxelize(self, frame: Frame, memory: _Memory) -> I64:
         """Enter every reading into the grid; return the box of cells that may pass the gate."""
         lattice, parts = memory.lattice, self._threads.count
-        limits, shape, shift = lattice.limits(), lattice.shape, lattice.subdivision - 1
+        limits, shape, shift = memory.limits, lattice.shape, lattice.subdivision - 1
         counting = self.cascade.source.counting
-        boxes = [new_box() for _ in range(parts)]
+        spans = [new_span() for _ in range(parts)]
 
         def mark(part: int) -> None:
-            cells, box = memory.flat[part], boxes[part]
+            cells, span = memory.flat[part], spans[part]
             for cloud in frame.clouds:
                 low, high = _share(len(cloud.points), part, parts)
                 T = part_transform(cloud, lattice)
-                mark_points(cloud.points[low:high], T, limits, shape, shift, counting, box, cells)
+                mark_points(cloud.points[low:high], T, limits, shape, shift, counting, span, cells)
             for image in frame.depths:
                 rays = self._rays_of(image, lattice)
                 low, high = _share(len(image.depth), part, parts)
                 mark_depth(
-                    image.depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting, box, cells
+                    image.depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting, span, cells
                 )
 
         self._threads.run(mark, [(part,) for part in range(parts)])
-        box = boxes[0]
-        for cells, other in zip(memory.cells[1:], boxes[1:], strict=True):
-            merge(memory.cells[0], cells, other, counting)
-            box[:3] = np.minimum(box[:3], other[:3])
-            box[3:] = np.maximum(box[3:], other[3:])
-        if box[3] < 0:
+        if all(span[1] < 0 for span in spans):
             memory.in_use = False
             raise _nothing_in_range(frame, lattice.region)
+        box = np.empty(6, np.int64)
+        for cells, span in zip(memory.cells[1:], spans[1:], strict=True):
+            if span[1] >= 0:
+                occupied_box(cells, span, box)
+                merge(memory.cells[0], cells, box, counting)
+        span = np.array([min(span[0] for span in spans), max(span[1] for span in spans)])
+        occupied_box(memory.cells[0], span, box)
         box[:3] = np.maximum(box[:3] - memory.reach, 0)
         box[3:] = np.minimum(box[3:] + memory.reach, np.array(shape) - 1)
         return box
 
     def _integrate(self, memory: _Memory, box: I64) -> npt.NDArray[Any]:
-        nx, ny, nz = (int(n) for n in box[3:] - box[:3] + 2)
-        shape = (nx, ny, -(-nz // VECTOR) * VECTOR)
+        """Return the integral volume of ``box``, with empty cells below and above for the boxes of the gate."""
+        nx, ny, nz = (int(n) for n in box[3:] - box[:3] + 1)
+        shape = (nx + 1, ny + 1, memory.below + padded(nz) + memory.above + 1)
         S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
-        integrate(memory.cells[0], box, self.cascade.source.counting, S)
+        memory.longer[:] = box
+        memory.longer[2] -= memory.below
+        integrate(memory.cells[0], memory.longer, self.cascade.source.counting, S)
         return S
 
     def _gate(self, S: npt.NDArray[Any], box: I64, memory: _Memory) -> I32:
-        parts, slices, top = self._threads.count, S.shape[0] - 1, int(box[5] - box[2] + 1)
+        parts, slices, height = self._threads.count, S.shape[0] - 1, int(box[5] - box[2] + 1)
         found = [0] * parts
 
         def sweep(part: int) -> None:
             low, high = _share(slices, part, parts)
-            gate = memory.gates[part]
-            arguments = (S, low, high, top, *gate.tables, *gate.memory(S.shape[2]))
+            gate, below = memory.gates[part], memory.below
+            arguments = (S, low, high, below, below + height, *gate.tables, *gate.memory(height))
             found[part] = gate_columns(*arguments, memory.survivors[part])
             if found[part] > len(memory.survivors[part]):
                 memory.survivors[part] = np.empty((2 * found[part], 3), np.int32)
@@ -180,8 +185,8 @@ class Detector:
                 )  # fmt: skip
             elif stages is not None:
                 vote_stages(
-                    S, survivors, memory.seen, low, high, stages.occupied_stages, *memory.tables, memory.features[part],
-                    scores,
+                    S, survivors, memory.seen, low, high, stages.occupied_stages, *memory.tables,
+                    memory.corners[part], memory.features[part], scores,
                 )  # fmt: skip
 
         self._threads.run(score, [(part,) for part in range(parts)])
@@ -194,7 +199,7 @@ class Detector:
         return memory.peaks[:found]
 
     def _judge(
-        self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, box: I64, memory: _Memory
+        self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: _Memory
     ) -> tuple[I64, I64]:
         """Let the peaks through that reach the cascade's threshold, after a look at what the cameras saw empty."""
         cascade, stages = self.cascade.source, self.cascade.stages
@@ -202,28 +207,29 @@ class Detector:
         if sees and stages is not None and len(peaks):
             cells = survivors[peaks]
             states = np.zeros((len(cells), len(memory.offsets)), np.uint8)
-            in_lattice = cells + box[:3].astype(np.int32)
+            in_lattice = cells + memory.longer[:3].astype(np.int32)
             for image in frame.depths:
                 look_about(image.depth, camera_table(image, memory.lattice), in_lattice, memory.offsets, states)
             seen = np.empty((len(cells), len(memory.offset_start) - 1, 2), np.int32)
             count_states(states, memory.offset_start, seen)
             judged = np.empty(len(cells), np.int64)
             vote_stages(
-                S, cells, seen, 0, len(cells), len(stages.stage_keep), *memory.tables, memory.features[0], judged
+                S, cells, seen, 0, len(cells), len(stages.stage_keep), *memory.tables, memory.corners[0],
+                memory.features[0], judged,
             )
             scores[peaks] = judged
         least = self.config.min_score
         if least is None:
-            least = cascade.min_score if sees or not cascade.sees else cascade.min_score_occupied
+            least = cascade.min_score if sees or not memory.sees else cascade.min_score_occupied
         return peaks[scores[peaks] >= math.ceil(least * SCORE_UNIT)], scores
 
     def _refine(
-        self, frame: Frame, cells: I32, scores: I64, peaks: I64, box: I64, memory: _Memory
+        self, frame: Frame, cells: I32, scores: I64, peaks: I64, memory: _Memory
     ) -> Heads:
         count = len(cells)
         if count == 0:
             return Heads()
-        cells = cells + box[:3].astype(np.int32)
+        cells = cells + memory.longer[:3].astype(np.int32)
         centres = memory.lattice.centres(cells)
         radii = np.full(count, 0.1)
         if self.config.refine == "sphere":
@@ -253,7 +259,7 @@ class Detector:
             lattice = Lattice.over(region, self.cascade.voxel_m, self.cascade.source.subdivision)
             if self._memory is None or self._memory.lattice.shape != lattice.shape:
                 self._memory = _Memory(lattice, self)
-            self._memory.lattice = lattice
+            self._memory.place(lattice)
         return self._memory
 
     def _region(self, frame: Frame) -> Region:
@@ -288,15 +294,17 @@ class _Memory:
         cell_type = np.uint32 if counting else np.uint8
         sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
         cells = math.prod(lattice.shape)
-        self.lattice = lattice
+        self.place(lattice)
         self.in_use = False
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
         nx, ny, nz = lattice.shape
-        length = -(-(nz + 1) // VECTOR) * VECTOR
+        self.below, self.above = margins(cascade.gate)
+        length = self.below + padded(nz) + self.above + 1
         self.S = np.empty((nx + 1) * (ny + 1) * length, sum_type)
         self.index = np.zeros(nx * ny * length, np.int32)
-        self.gates = [GateTables.of(cascade.gate, self.S.dtype, length) for _ in range(threads)]
+        self.longer = np.zeros(6, np.int64)
+        self.gates = [GateTables.of(cascade.gate, self.S.dtype, nz) for _ in range(threads)]
         self.reach = int(np.abs(cascade.gate.boxes).max(initial=1))
         self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
         self.points = np.empty((MOST_PARTS, 3))
@@ -304,13 +312,21 @@ class _Memory:
         self.offsets, self.offset_start = np.empty((0, 3), np.int32), np.zeros(1, np.int32)
         self.tables: tuple[Any, ...] = ()
         self.features = [np.empty(0, np.int64)] * threads
+        self.corners = [np.empty((0, 8), np.int64)] * threads
+        self.sees = cascade.source.sees
         if cascade.stages is not None:
             boxes, seen_start = seen_boxes(cascade.stages)
             self.offsets, self.offset_start = cells_of(boxes)
             self.tables = stage_tables(cascade.stages, seen_start)
+            self.corners = [np.empty((len(cascade.stages.boxes), 8), np.int64) for _ in range(threads)]
             self.features = [np.zeros(feature_count(cascade.stages), np.int64) for _ in range(threads)]
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
+
+    def place(self, lattice: Lattice) -> None:
+        """Stand for another region of the same shape."""
+        self.lattice = lattice
+        self.limits = lattice.limits()
 
     def make_room(self, candidates: int) -> None:
         """Have room for as many candidates."""

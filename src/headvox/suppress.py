@@ -20,11 +20,14 @@ def local_maxima(cells, scores, least, index, peaks):  # type: ignore[no-untyped
     """
     nx, ny, nz = index.shape
     for i in range(cells.shape[0]):
-        index[cells[i, 0], cells[i, 1], cells[i, 2]] = i + 1
+        if scores[i] >= least:
+            index[cells[i, 0], cells[i, 1], cells[i, 2]] = i + 1
     found = 0
     for i in range(cells.shape[0]):
         score = scores[i]
-        best = score >= least
+        if score < least:
+            continue
+        best = True
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         for a in range(max(x - 1, 0), min(x + 2, nx)):
             for b in range(max(y - 1, 0), min(y + 2, ny)):
@@ -37,7 +40,8 @@ def local_maxima(cells, scores, least, index, peaks):  # type: ignore[no-untyped
             peaks[found] = i
             found += 1
     for i in range(cells.shape[0]):
-        index[cells[i, 0], cells[i, 1], cells[i, 2]] = 0
+        if scores[i] >= least:
+            index[cells[i, 0], cells[i, 1], cells[i, 2]] = 0
     return found
 
 

@@ -9,6 +9,8 @@ integers; after each stage a candidate below the stage's threshold is dropped, s
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -84,23 +86,48 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
 
 
 @rule
-def _statistics(sums, count, out):  # type: ignore[no-untyped-def]
-    """Sort the first ``count`` sums; write smallest, 3rd smallest, 3rd largest, largest and total to ``out``."""
+def _statistics(sums, count, ranked, out):  # type: ignore[no-untyped-def]
+    """Write smallest, 3rd smallest, 3rd largest and largest of ``sums`` (if ``ranked``; it sorts them) and their total."""
     total = sums[0]
     for i in range(1, count):
-        value = sums[i]
-        total += value
-        j = i - 1
-        while j >= 0 and sums[j] > value:
-            sums[j + 1] = sums[j]
-            j -= 1
-        sums[j + 1] = value
-    if count > 1:
+        total += sums[i]
+    out[4] = total
+    if ranked:
+        for i in range(1, count):
+            value = sums[i]
+            j = i - 1
+            while j >= 0 and sums[j] > value:
+                sums[j + 1] = sums[j]
+                j -= 1
+            sums[j + 1] = value
         out[0] = sums[0]
         out[1] = sums[2]
         out[2] = sums[count - 3]
         out[3] = sums[count - 1]
-    out[4] = total
+
+
+@rule
+def _corners(S, boxes, corners):  # type: ignore[no-untyped-def]
+    """Write where a box's corners lie in the flat S, from the candidate's voxel, in the order of :func:`_sum_at`."""
+    along_x, along_y = S.shape[1] * S.shape[2], S.shape[2]
+    for b in range(boxes.shape[0]):
+        x0, x1 = boxes[b, 0] * along_x, boxes[b, 1] * along_x
+        y0, y1 = boxes[b, 2] * along_y, boxes[b, 3] * along_y
+        z0, z1 = boxes[b, 4], boxes[b, 5]
+        corners[b, 0], corners[b, 1] = x1 + y1 + z1, x1 + y1 + z0
+        corners[b, 2], corners[b, 3] = x0 + y1 + z1, x0 + y1 + z0
+        corners[b, 4], corners[b, 5] = x1 + y0 + z1, x1 + y0 + z0
+        corners[b, 6], corners[b, 7] = x0 + y0 + z1, x0 + y0 + z0
+
+
+@rule
+def _sum_at(flat, at, corner, mask):  # type: ignore[no-untyped-def]
+    """Return the sum over a box that lies within the volume: eight look-ups and no more."""
+    a = np.int64(flat[at + corner[0]]) - np.int64(flat[at + corner[1]])
+    b = np.int64(flat[at + corner[2]]) - np.int64(flat[at + corner[3]])
+    c = np.int64(flat[at + corner[4]]) - np.int64(flat[at + corner[5]])
+    d = np.int64(flat[at + corner[6]]) - np.int64(flat[at + corner[7]])
+    return (a - b - c + d) & mask
 
 
 @rule
@@ -114,31 +141,44 @@ def _descend(tree, features, feature, cut, left, right):  # type: ignore[no-unty
 
 @kernel
 def vote_stages(  # type: ignore[no-untyped-def]
-    S, cells, seen, first, last, to_stage, boxes, group_start, group_channel, seen_start, feature, cut, left,
-    right, leaf, root, stage_groups, stage_trees, stage_keep, features, scores,
+    S, cells, seen, first, last, to_stage, boxes, reach, group_start, group_channel, group_ranked, seen_start, feature,
+    cut, left, right, leaf, root, stage_groups, stage_trees, stage_keep, corners, features, scores,
 ):  # fmt: skip
     """Write the sum of the trees of the first ``to_stage`` stages to ``scores``; DROPPED where a stage says so.
 
-    ``features`` (features,) is working memory. ``seen`` (candidates, boxes of other channels, 2) holds how many cells
-    of a box are known-empty and hidden.
+    ``corners`` (boxes, 8) and ``features`` (features,) are working memory. ``seen`` (candidates, boxes of other
+    channels, 2) holds how many cells of a box are known-empty and hidden.
     """
+    _corners(S, boxes, corners)
+    flat = S.reshape(-1)
+    nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
+    mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
     sums = np.empty(64, np.int64)
     for i in range(first, last):
-        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        x, y, z = np.int64(cells[i, 0]), np.int64(cells[i, 1]), np.int64(cells[i, 2])
+        at = (x * S.shape[1] + y) * S.shape[2] + z
+        inside = (
+            x + reach[0] >= 0 and x + reach[1] <= nx and y + reach[2] >= 0 and y + reach[3] <= ny
+            and z + reach[4] >= 0 and z + reach[5] <= nz
+        )  # fmt: skip
         score = np.int64(0)
         for s in range(to_stage):
             for g in range(stage_groups[s], stage_groups[s + 1]):
                 begin, count, channel = group_start[g], group_start[g + 1] - group_start[g], group_channel[g]
-                for k in range(count):
-                    if channel == 0:
-                        sums[k] = sum_about(S, x, y, z, boxes[begin + k])
-                    else:
+                if channel:
+                    for k in range(count):
                         sums[k] = seen[i, seen_start[g] + k, channel - 1]
-                _statistics(sums, count, features[FEATURES_PER_GROUP * g :])
+                elif inside:
+                    for k in range(count):
+                        sums[k] = _sum_at(flat, at, corners[begin + k], mask)
+                else:
+                    for k in range(count):
+                        sums[k] = sum_about(S, x, y, z, boxes[begin + k])
+                _statistics(sums, count, group_ranked[g], features[FEATURES_PER_GROUP * g :])
             for t in range(stage_trees[s], stage_trees[s + 1]):
                 score += leaf[_descend(root[t], features, feature, cut, left, right)]
             if score < stage_keep[s]:
-                score = np.int64(DROPPED)
+                score = DROPPED
                 break
         scores[i] = score
 
@@ -172,13 +212,18 @@ def score_by_stages(
     seen = np.zeros((len(cells), 1, 2), np.int32) if seen is None else seen
     scores = np.zeros(len(cells), np.int64)
     features = np.zeros(feature_count(stages), np.int64)
-    vote_stages(S, cells, seen, 0, len(cells), to_stage, *stage_tables(stages, seen_start), features, scores)
+    corners = np.empty((len(stages.boxes), 8), np.int64)
+    vote_stages(S, cells, seen, 0, len(cells), to_stage, *stage_tables(stages, seen_start), corners, features, scores)
     return scores
 
 
-def stage_tables(stages: CompiledStages, seen_start: I32) -> tuple[npt.NDArray[np.int32] | I64, ...]:
+def stage_tables(stages: CompiledStages, seen_start: I32) -> tuple[npt.NDArray[Any], ...]:
     """Return the tables of ``stages`` in the order of :func:`vote_stages`."""
+    looked_up = stages.boxes[np.repeat(stages.group_channel == 0, np.diff(stages.group_start))].astype(np.int64)
+    reach = np.array([(looked_up[:, k].min if k % 2 == 0 else looked_up[:, k].max)(initial=0) for k in range(6)])
+    ranked = np.zeros(len(stages.group_channel), np.bool_)
+    ranked[stages.feature[stages.feature % FEATURES_PER_GROUP != FEATURES_PER_GROUP - 1] // FEATURES_PER_GROUP] = True
     return (
-        stages.boxes, stages.group_start, stages.group_channel, seen_start, stages.feature, stages.cut, stages.left,
-        stages.right, stages.leaf, stages.root, stages.stage_groups, stages.stage_trees, stages.stage_keep,
+        stages.boxes, reach, stages.group_start, stages.group_channel, ranked, seen_start, stages.feature, stages.cut,
+        stages.left, stages.right, stages.leaf, stages.root, stages.stage_groups, stages.stage_trees, stages.stage_keep,
     )  # fmt: skip

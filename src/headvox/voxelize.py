@@ -20,9 +20,10 @@ import numpy.typing as npt
 from headvox.data import F32, F64, U16, Cloud, DepthImage
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
-from headvox.kernels import kernel
+from headvox.kernels import kernel, rule
 
 NOWHERE = np.int32(-1)
+FARTHEST = np.int32(2**31 - 1)
 MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
 BLOCK = 1024  # points coded at a time: the codes stay in the first-level cache
 
@@ -90,90 +91,70 @@ class Lattice:
         return centres
 
 
-def new_box() -> npt.NDArray[np.int64]:
-    """Return an empty bounding box: lowest and highest cell in x, y, z."""
-    return np.array([2**30, 2**30, 2**30, -1, -1, -1], dtype=np.int64)
+def new_span() -> npt.NDArray[np.int32]:
+    """Return an empty span of codes: lowest and highest."""
+    return np.array([FARTHEST, NOWHERE], dtype=np.int32)
+
+
+@rule
+def _code(x, y, z, limits, ny, nz, shift):  # type: ignore[no-untyped-def]
+    """Return cell * 8 + part of a place in parts from the origin, or NOWHERE if it is outside the region or NaN."""
+    dx = x - limits[0]
+    dy = y - limits[1]
+    dz = z - limits[2]
+    keep = (dx * dx + dy * dy + dz * dz < limits[3]) & (z >= limits[4]) & (z < limits[5])
+    ix = np.int32(x)
+    iy = np.int32(y)
+    iz = np.int32(z)
+    cell = ((ix >> shift) * ny + (iy >> shift)) * nz + (iz >> shift)
+    part = ((ix & shift) << 2) | ((iy & shift) << 1) | (iz & shift)
+    return (cell << 3 | part) if keep else NOWHERE
 
 
 @kernel
-def _code_points(xyz, T, limits, shape, shift, box, codes):  # type: ignore[no-untyped-def]
-    """Write cell * 8 + part of each point to ``codes``, or NOWHERE; widen ``box`` by the cells.
+def _code_points(xyz, T, limits, shape, shift, span, codes):  # type: ignore[no-untyped-def]
+    """Write the code of each point to ``codes``; widen ``span`` by them.
 
     ``xyz`` is flat: with a row length that the compiler knows, it loads whole vectors.
     """
-    ny = np.int32(shape[1])
-    nz = np.int32(shape[2])
-    m = np.int32(shift)
-    cx, cy, cz, r2, low, high = limits[0], limits[1], limits[2], limits[3], limits[4], limits[5]
-    x0, y0, z0 = np.int32(box[0]), np.int32(box[1]), np.int32(box[2])
-    x1, y1, z1 = np.int32(box[3]), np.int32(box[4]), np.int32(box[5])
+    ny, nz, m = np.int32(shape[1]), np.int32(shape[2]), np.int32(shift)
+    bounds = (limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
     tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
     xx, xy, xz = T[0, 0], T[0, 1], T[0, 2]
     yx, yy, yz = T[1, 0], T[1, 1], T[1, 2]
     zx, zy, zz = T[2, 0], T[2, 1], T[2, 2]
-    big = np.int32(2**30)
+    lowest, highest = span[0], span[1]
     for i in range(xyz.shape[0] // 3):
         px, py, pz = xyz[3 * i], xyz[3 * i + 1], xyz[3 * i + 2]
         x = tx + (xx * px + xy * py + xz * pz)
         y = ty + (yx * px + yy * py + yz * pz)
         z = tz + (zx * px + zy * py + zz * pz)
-        dx = x - cx
-        dy = y - cy
-        dz = z - cz
-        keep = (dx * dx + dy * dy + dz * dz < r2) & (z >= low) & (z < high)
-        ix = np.int32(x)
-        iy = np.int32(y)
-        iz = np.int32(z)
-        vx = ix >> m
-        vy = iy >> m
-        vz = iz >> m
-        part = ((ix & m) << 2) | ((iy & m) << 1) | (iz & m)
-        codes[i] = (((vx * ny + vy) * nz + vz) << 3 | part) if keep else NOWHERE
-        x0 = min(x0, vx if keep else big)
-        y0 = min(y0, vy if keep else big)
-        z0 = min(z0, vz if keep else big)
-        x1 = max(x1, vx if keep else NOWHERE)
-        y1 = max(y1, vy if keep else NOWHERE)
-        z1 = max(z1, vz if keep else NOWHERE)
-    box[0], box[1], box[2], box[3], box[4], box[5] = x0, y0, z0, x1, y1, z1
+        code = _code(x, y, z, bounds, ny, nz, m)
+        codes[i] = code
+        lowest = min(lowest, code if code >= 0 else FARTHEST)
+        highest = max(highest, code)
+    span[0], span[1] = lowest, highest
 
 
 @kernel
-def _code_depth_row(line, column, row_x, row_y, row_z, t, limits, shape, shift, box, codes):  # type: ignore[no-untyped-def]
+def _code_depth_row(line, column, row_x, row_y, row_z, t, limits, shape, shift, span, codes):  # type: ignore[no-untyped-def]
     """As :func:`_code_points`, for one row of a depth image: a pixel's point is ``t + depth * (column + row)``."""
-    ny = np.int32(shape[1])
-    nz = np.int32(shape[2])
-    m = np.int32(shift)
-    cx, cy, cz, r2, low, high = limits[0], limits[1], limits[2], limits[3], limits[4], limits[5]
-    x0, y0, z0 = np.int32(box[0]), np.int32(box[1]), np.int32(box[2])
-    x1, y1, z1 = np.int32(box[3]), np.int32(box[4]), np.int32(box[5])
+    ny, nz, m = np.int32(shape[1]), np.int32(shape[2]), np.int32(shift)
+    bounds = (limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
     tx, ty, tz = t[0], t[1], t[2]
     column_x, column_y, column_z = column[0], column[1], column[2]
-    big = np.int32(2**30)
+    lowest, highest = span[0], span[1]
     for u in range(line.shape[0]):
         depth = np.float32(line[u])
         x = tx + depth * (column_x[u] + row_x)
         y = ty + depth * (column_y[u] + row_y)
         z = tz + depth * (column_z[u] + row_z)
-        dx = x - cx
-        dy = y - cy
-        dz = z - cz
-        keep = (line[u] > 0) & (dx * dx + dy * dy + dz * dz < r2) & (z >= low) & (z < high)
-        ix = np.int32(x)
-        iy = np.int32(y)
-        iz = np.int32(z)
-        vx = ix >> m
-        vy = iy >> m
-        vz = iz >> m
-        part = ((ix & m) << 2) | ((iy & m) << 1) | (iz & m)
-        codes[u] = (((vx * ny + vy) * nz + vz) << 3 | part) if keep else NOWHERE
-        x0 = min(x0, vx if keep else big)
-        y0 = min(y0, vy if keep else big)
-        z0 = min(z0, vz if keep else big)
-        x1 = max(x1, vx if keep else NOWHERE)
-        y1 = max(y1, vy if keep else NOWHERE)
-        z1 = max(z1, vz if keep else NOWHERE)
-    box[0], box[1], box[2], box[3], box[4], box[5] = x0, y0, z0, x1, y1, z1
+        code = _code(x, y, z, bounds, ny, nz, m)
+        code = code if line[u] > 0 else NOWHERE
+        codes[u] = code
+        lowest = min(lowest, code if code >= 0 else FARTHEST)
+        highest = max(highest, code)
+    span[0], span[1] = lowest, highest
 
 
 @kernel
@@ -190,25 +171,50 @@ def _mark(codes, counting, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def mark_points(points, T, limits, shape, shift, counting, box, cells):  # type: ignore[no-untyped-def]
-    """Enter ``points`` (N, 3) into ``cells`` and widen ``box``."""
+def mark_points(points, T, limits, shape, shift, counting, span, cells):  # type: ignore[no-untyped-def]
+    """Enter ``points`` (N, 3) into ``cells`` and widen ``span``."""
     codes = np.empty(BLOCK, np.int32)
     xyz = points.reshape(-1)
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
-        _code_points(xyz[3 * start : 3 * (start + count)], T, limits, shape, shift, box, codes)
+        _code_points(xyz[3 * start : 3 * (start + count)], T, limits, shape, shift, span, codes)
         _mark(codes[:count], counting, cells)
 
 
 @kernel
-def mark_depth(depth, first, last, column, row, t, limits, shape, shift, counting, box, cells):  # type: ignore[no-untyped-def]
-    """Enter rows ``first`` to ``last`` (exclusive) of a depth image into ``cells`` and widen ``box``."""
+def mark_depth(depth, first, last, column, row, t, limits, shape, shift, counting, span, cells):  # type: ignore[no-untyped-def]
+    """Enter rows ``first`` to ``last`` (exclusive) of a depth image into ``cells`` and widen ``span``."""
     codes = np.empty(depth.shape[1], np.int32)
     for v in range(first, last):
         _code_depth_row(
-            depth[v], column, row[0, v], row[1, v], row[2, v], t, limits, shape, shift, box, codes
+            depth[v], column, row[0, v], row[1, v], row[2, v], t, limits, shape, shift, span, codes
         )
         _mark(codes, counting, cells)
+
+
+@kernel
+def occupied_box(cells, span, box):  # type: ignore[no-untyped-def]
+    """Write to ``box`` the lowest and highest occupied cell in x, y, z; the codes in ``cells`` lie within ``span``."""
+    nx, ny, nz = cells.shape
+    box[0], box[3] = (span[0] >> 3) // (ny * nz), (span[1] >> 3) // (ny * nz)
+    box[1], box[4] = ny, -1
+    over = np.zeros(nz, np.uint8)
+    for x in range(box[0], box[3] + 1):
+        for y in range(ny):
+            column = cells[x, y]
+            any_bits = np.uint8(0)
+            for z in range(nz):
+                bit = np.uint8(column[z] != 0)
+                any_bits |= bit
+                over[z] |= bit
+            if any_bits:
+                box[1] = min(box[1], y)
+                box[4] = max(box[4], y)
+    box[2], box[5] = nz, -1
+    for z in range(nz):
+        if over[z]:
+            box[2] = min(box[2], z)
+            box[5] = z
 
 
 @kernel
@@ -276,7 +282,7 @@ def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cell
         lattice.shape,
         lattice.subdivision - 1,
         count,
-        new_box(),
+        new_span(),
         cells,
     )
     return cells.reshape(lattice.shape)
@@ -298,7 +304,7 @@ def voxelize_depth(image: DepthImage, lattice: Lattice, count: bool = False) -> 
         lattice.shape,
         lattice.subdivision - 1,
         count,
-        new_box(),
+        new_span(),
         cells,
     )
     return cells.reshape(lattice.shape)

@@ -102,7 +102,7 @@ def _record(args: argparse.Namespace, stage: Callable[..., Scene]) -> None:
         scene = stage(seed=args.seed, duration_s=times[-1] * 1e-9 + 0.1)
         write = write_clouds if is_lidar else write_recording
         write(args.out, scene, times, args.workers, progress)
-    seen_by = f"{len(scene.cameras)} cameras" if scene.cameras else "a LiDAR"
+    seen_by = ", ".join(camera.name for camera in scene.cameras) or "a LiDAR"
     rows = [("frames", str(args.frames)), ("people", str(len(scene.actors))), ("seen by", seen_by)]
     _tell(args.out, rows, progress)
 
@@ -208,7 +208,7 @@ def _add_recording(parser: argparse.ArgumentParser, sensors: Sequence[str]) -> N
     if "any" in sensors:
         text += "; any: another one for each camera, from clean to terrible"
     parser.add_argument("--sensor", choices=sensors, default="d435i", help=text)
-    parser.add_argument("--frames", type=whole(1, 1_000_000), default=100, metavar="N", help="(100)")
+    parser.add_argument("--frames", type=whole(1, 1_000_000), default=100, metavar="N", help="how many (100)")
     parser.add_argument("--hz", type=rate, metavar="HZ", help="frames a second (10)")
     _add_making(parser)
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image, ImageDraw
 from scipy.stats import qmc
 
@@ -44,6 +45,8 @@ HEADVOX_TO_PAPER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
 TILE_PX = (150, 180)
 TILE_M = 0.34  # wide
 VIEW_FROM_M = 20.0  # far enough for parallel rays
+
+Picture = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +156,10 @@ def make_heads(
     settings = {"count": count, "points": points, "metric": metric, "seed": seed}
     _claim(out / "settings.json", settings)
     job = partial(_write_head, out=out, points=points, metric=metric, seed=seed)
-    entries = []
-    for entry in in_processes(job, identities, workers):
+    entries, pictures = [], []
+    for entry, picture in in_processes(job, identities, workers):
         entries.append(entry)
+        pictures.append(picture)
         if on_done is not None:
             on_done(len(entries))
     manifest = {
@@ -167,7 +171,7 @@ def make_heads(
         "eye_distance_m": None if metric else EYE_DISTANCE_M,
         "heads": entries,
     }
-    _contact_sheet(out / "heads.png", [make_shell(identity, metric) for identity in identities])
+    _contact_sheet(out / "heads.png", pictures)
     with _replacing(out / "manifest.json") as path:
         path.write_text(json.dumps(manifest, indent=1) + "\n")
 
@@ -188,8 +192,10 @@ def _claim(path: Path, settings: dict[str, Any]) -> None:
         fresh.write_text(text)
 
 
-def _write_head(identity: Identity, out: Path, points: int, metric: bool, seed: int) -> dict[str, Any]:
-    """Write what is missing of one head and return its entry of the manifest."""
+def _write_head(
+    identity: Identity, out: Path, points: int, metric: bool, seed: int
+) -> tuple[dict[str, Any], Picture]:
+    """Write what is missing of one head; return its entry of the manifest and its picture."""
     shell = make_shell(identity, metric)
     cloud, mesh = (out / f"head_{identity.number:02d}{kind}.ply" for kind in ("", "_mesh"))
     if not mesh.exists():
@@ -200,7 +206,7 @@ def _write_head(identity: Identity, out: Path, points: int, metric: bool, seed: 
             rng = np.random.default_rng([seed, identity.number])
             path.write_bytes(ply_bytes(spread_points(shell.vertices, shell.faces, points, rng)))
     size = np.ptp(shell.vertices, axis=0)
-    return {
+    entry = {
         **asdict(identity),
         "cloud": cloud.name,
         "mesh": mesh.name,
@@ -210,6 +216,7 @@ def _write_head(identity: Identity, out: Path, points: int, metric: bool, seed: 
         "size": np.round(size, 6).tolist(),
         "scale": round(shell.scale, 9),
     }
+    return entry, _picture(shell)
 
 
 def ply_bytes(vertices: F64, faces: I32 | None = None) -> bytes:
@@ -234,22 +241,22 @@ def _replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _contact_sheet(path: Path, shells: list[HeadShell]) -> None:
-    """Draw all heads from the front left, shaded, on one picture."""
-    columns = min(11, len(shells))
-    rows = -(-len(shells) // columns)
+def _contact_sheet(path: Path, pictures: list[Picture]) -> None:
+    """Put the pictures of all heads on one."""
+    columns = min(11, len(pictures))
+    rows = -(-len(pictures) // columns)
     width, height = TILE_PX
     sheet = Image.new("L", (columns * width, rows * height), 255)
     draw = ImageDraw.Draw(sheet)
-    for number, shell in enumerate(shells):
+    for number, picture in enumerate(pictures):
         corner = (number % columns * width, number // columns * height)
-        sheet.paste(Image.fromarray(_picture(shell)), corner)
+        sheet.paste(Image.fromarray(picture), corner)
         draw.text((corner[0] + 4, corner[1] + 3), f"{number:02d}", fill=0)
     with _replacing(path) as temporary:
         sheet.save(temporary, format="PNG")
 
 
-def _picture(shell: HeadShell) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def _picture(shell: HeadShell) -> Picture:
     """Return a shaded view (height, width) from the front left."""
     width, height = TILE_PX
     turn = np.radians(30.0)

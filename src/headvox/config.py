@@ -48,9 +48,13 @@ class DetectorConfig:
             _check_type(field.name, getattr(self, field.name))
         if self.centre is not None:
             object.__setattr__(self, "centre", tuple(float(v) for v in self.centre))
-        _require(0.0 < self.max_range_m <= 50.0, "max_range_m", "more than 0 and at most 50 m", self.max_range_m)
+        _require(
+            0.0 < self.max_range_m <= 50.0, "max_range_m", "more than 0 and at most 50 m", self.max_range_m
+        )
         low, high = self.min_height_m, self.max_height_m
-        _require(low < high <= low + 20.0, "max_height_m", f"above min_height_m ({low:g}), by 20 m at most", high)
+        _require(
+            low < high <= low + 20.0, "max_height_m", f"above min_height_m ({low:g}), by 20 m at most", high
+        )
         _require(self.refine in ("sphere", "none"), "refine", '"sphere" or "none"', self.refine)
         _require(1 <= self.threads <= 64, "threads", "1 to 64", self.threads)
         if self.voxel_m is not None:
@@ -81,7 +85,9 @@ def load_config(path: str | Path) -> DetectorConfig:
     except OSError as error:
         raise HeadvoxError(f"Configuration {path}: {error.strerror or error}.", "Check the path.") from None
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, too many digits, nested too deep
-        raise HeadvoxError(f"Configuration {path} is not TOML: {error}.", "`headvox config` prints one.") from None
+        raise HeadvoxError(
+            f"Configuration {path} is not TOML: {error}.", "`headvox config` prints one."
+        ) from None
     unknown = sorted(set(tables) - {"detector"})
     if unknown:
         raise HeadvoxError(f"Configuration {path}: unknown table [{unknown[0]}].", "Expected [detector].")

@@ -21,11 +21,17 @@ def as_rigid(matrix: npt.ArrayLike, name: str) -> F64:
     try:
         T = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError):
-        raise HeadvoxError(f"{name}: expected a 4x4 matrix of numbers.", "Give four rows of four numbers.") from None
+        raise HeadvoxError(
+            f"{name}: expected a 4x4 matrix of numbers.", "Give four rows of four numbers."
+        ) from None
     if T.shape != (4, 4):
-        raise HeadvoxError(f"{name}: expected a 4x4 matrix, got shape {T.shape}.", "Give four rows of four numbers.")
+        raise HeadvoxError(
+            f"{name}: expected a 4x4 matrix, got shape {T.shape}.", "Give four rows of four numbers."
+        )
     if not np.isfinite(T).all():
-        raise HeadvoxError(f"{name}: the matrix has NaN or infinite entries.", "An unknown transform is not usable.")
+        raise HeadvoxError(
+            f"{name}: the matrix has NaN or infinite entries.", "An unknown transform is not usable."
+        )
     if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > RIGID_TOLERANCE:
         raise HeadvoxError(f"{name}: the last row is {T[3].tolist()}, expected 0 0 0 1.", "Is it transposed?")
     R = T[:3, :3]

@@ -27,7 +27,8 @@ class Region:
     def limits(self) -> F32:
         """Return (6,) float32: centre, radius squared, lowest and highest height, as the kernels read it."""
         return np.array(
-            [*self.centre, self.radius_m * self.radius_m, self.min_height_m, self.max_height_m], dtype=np.float32
+            [*self.centre, self.radius_m * self.radius_m, self.min_height_m, self.max_height_m],
+            dtype=np.float32,
         )
 
 

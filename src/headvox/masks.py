@@ -34,7 +34,8 @@ I64 = npt.NDArray[np.int64]
 
 FORMAT = "headvox-cascade"
 CHANNELS = ("occupied", "empty", "hidden")
-STATISTICS = ("min", "low", "high", "max", "sum")  # smallest, 3rd smallest, 3rd largest, largest, all together
+# smallest, 3rd smallest, 3rd largest, largest, all together
+STATISTICS = ("min", "low", "high", "max", "sum")
 SCORE_UNIT = 1024
 MAX_FILE_BYTES = 8 << 20
 MAX_EXTENT_M = 2.0
@@ -92,7 +93,8 @@ class Votes:
     min_votes: int
 
 
-Tree = float | tuple[str, float, "Tree", "Tree"]  # a leaf's weight, or (feature, cut, at most the cut, above it)
+# a leaf's weight, or (feature, cut, at most the cut, above it)
+Tree = float | tuple[str, float, "Tree", "Tree"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +126,9 @@ class Cascade:
     @property
     def sees(self) -> bool:
         """Whether some stage asks what the sensors saw to be empty or hidden."""
-        used = {name.rpartition(".")[0] for stage in self.stages for tree in stage.trees for name, _ in cuts(tree)}
+        used = {
+            name.rpartition(".")[0] for stage in self.stages for tree in stage.trees for name, _ in cuts(tree)
+        }
         return any(group.channel != "occupied" for group in self.groups if group.name in used)
 
 
@@ -153,7 +157,9 @@ def load_cascade(name_or_path: str | Path) -> Cascade:
     """
     name = str(name_or_path)
     if name in shipped_cascades():
-        return parse_cascade((resources.files("headvox") / "cascades" / f"{name}.toml").read_text("utf-8"), name)
+        return parse_cascade(
+            (resources.files("headvox") / "cascades" / f"{name}.toml").read_text("utf-8"), name
+        )
     path = Path(name)
     if not path.is_file():
         raise HeadvoxError(
@@ -161,7 +167,9 @@ def load_cascade(name_or_path: str | Path) -> Cascade:
             "Check the name, or the path.",
         )
     if path.stat().st_size > MAX_FILE_BYTES:
-        raise HeadvoxError(f"Cascade {name}: larger than {MAX_FILE_BYTES >> 20} MiB.", "That is no cascade file.")
+        raise HeadvoxError(
+            f"Cascade {name}: larger than {MAX_FILE_BYTES >> 20} MiB.", "That is no cascade file."
+        )
     try:
         text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -190,7 +198,9 @@ class _Reader:
         except ValueError:  # Python does not write whole numbers of more than 4300 digits
             shown = "a number of thousands of digits"
         shown = shown if len(shown) < 80 else shown[:77] + "..."
-        return HeadvoxError(f"Cascade {self.origin}: {where}: expected {expected}, got {shown}.", "Mend the file.")
+        return HeadvoxError(
+            f"Cascade {self.origin}: {where}: expected {expected}, got {shown}.", "Mend the file."
+        )
 
     def table(self, value: object, where: str, known: set[str]) -> dict[str, Any]:
         if not isinstance(value, dict):
@@ -335,8 +345,8 @@ class _Reader:
         )
 
     def cascade(self, value: dict[str, Any]) -> Cascade:
-        known = {"format", "version", "name", "summary", "voxel_m", "subdivision", "occupancy", "gate", "votes"}
-        known |= {"group", "stage", "min_score", "min_score_occupied", "tuned_on"}
+        known = {"format", "version", "name", "summary", "voxel_m", "subdivision", "occupancy", "gate"}
+        known |= {"votes", "group", "stage", "min_score", "min_score_occupied", "tuned_on"}
         table = self.table(value, "the file", known)
         if table.get("format") != FORMAT or table.get("version") != 1:
             raise self.error("format, version", f'"{FORMAT}", 1', (table.get("format"), table.get("version")))
@@ -357,16 +367,22 @@ class _Reader:
                 raise self.error(f"group {group.name}", "a name of its own", group.name)
             names.add(group.name)
         features = {f"{group.name}.{statistic}" for group in groups for statistic in statistics(group)}
-        conditions = tuple(self.condition(entry, "gate") for entry in self.items(table.get("gate", []), "gate"))
+        conditions = tuple(
+            self.condition(entry, "gate") for entry in self.items(table.get("gate", []), "gate")
+        )
         if all(condition.minimum <= 0.0 for condition in conditions):
-            raise self.error("gate", "a condition with min above 0, as only places near points are searched", "none")
+            raise self.error(
+                "gate", "a condition with min above 0, as only places near points are searched", "none"
+            )
         stages = tuple(self.stage(entry, features) for entry in self.items(table.get("stage", []), "stage"))
         blind = {group.name for group in groups if group.channel == "occupied"}
         for tree in stages[0].trees if stages else ():
             for feature, _ in cuts(tree):
                 if feature.rpartition(".")[0] not in blind:
                     # Neighbours compete by what is occupied; only the winners are looked at through the cameras.
-                    raise self.error(f"stage {stages[0].name}", 'only "occupied" groups, as it is the first', feature)
+                    raise self.error(
+                        f"stage {stages[0].name}", 'only "occupied" groups, as it is the first', feature
+                    )
         min_score = self.number(table.get("min_score"), "min_score")
         return Cascade(
             name=self.text(table.get("name"), "name"),
@@ -380,7 +396,9 @@ class _Reader:
             stages=stages,
             min_score=min_score,
             min_score_occupied=self.number(table.get("min_score_occupied", min_score), "min_score_occupied"),
-            tuned_on=tuple(self.text(entry, "tuned_on") for entry in self.items(table.get("tuned_on", []), "tuned_on")),
+            tuned_on=tuple(
+                self.text(entry, "tuned_on") for entry in self.items(table.get("tuned_on", []), "tuned_on")
+            ),
         )
 
 
@@ -502,7 +520,10 @@ def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledC
     stages = _compile_stages(cascade, voxel, unit) if cascade.stages else None
     # The gate adds up the boxes of a condition in the type of the volume, signed; stage 2 adds up in 64 bits.
     sums = [
-        2 * sum(abs(int(w)) * volume(box[None]) for w, box in zip(gate.weights[a:b], gate.boxes[a:b], strict=True))
+        2
+        * sum(
+            abs(int(w)) * volume(box[None]) for w, box in zip(gate.weights[a:b], gate.boxes[a:b], strict=True)
+        )
         for a, b in zip(gate.start[:-1], gate.start[1:], strict=True)
     ]
     tables = [gate.boxes]
@@ -598,7 +619,9 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
         for statistic in statistics(group):
             sizes[f"{group.name}.{statistic}"] = cells if statistic == "sum" else cells / len(mine)
 
-    seen = [voxel_box(box, voxel) for group, _ in groups if group.channel != "occupied" for box in group.boxes]
+    seen = [
+        voxel_box(box, voxel) for group, _ in groups if group.channel != "occupied" for box in group.boxes
+    ]
     if volume(_box_table(seen)) > MAX_SEEN_CELLS:
         raise HeadvoxError(
             f'Cascade {cascade.name}: its "empty" and "hidden" boxes have {volume(_box_table(seen))} cells of '

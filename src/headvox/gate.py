@@ -133,6 +133,22 @@ def column_bound(gate: CompiledGate) -> npt.NDArray[np.int64]:
     return best
 
 
+def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
+    """Return how far from an occupied voxel a candidate can lie: what to add to the lowest and highest occupied cell.
+
+    It follows from a condition with a lower limit above 0 on one box: that box holds an occupied voxel. The result
+    never narrows the occupied box.
+    """
+    reaches = [
+        np.concatenate([1 - gate.boxes[first, 1::2], -gate.boxes[first, 0::2]])
+        for first, after, low in zip(gate.start[:-1], gate.start[1:], gate.low, strict=True)
+        if after - first == 1 and gate.weights[first] > 0 and low > 0
+    ]
+    widest = np.array([-1, -1, -1, 1, 1, 1]) * np.abs(gate.boxes).max(initial=1)
+    reach = min(reaches, key=lambda reach: int((reach[3:] - reach[:3]).sum()), default=widest).astype(np.int64)
+    return np.concatenate([np.minimum(reach[:3], 0), np.maximum(reach[3:], 0)])
+
+
 def margins(gate: CompiledGate) -> tuple[int, int]:
     """Return how many voxels below and above a candidate the boxes of ``gate`` reach."""
     return int(max(-gate.boxes[:, 4].min(initial=0), 0)), int(max(gate.boxes[:, 5].max(initial=0), 0))

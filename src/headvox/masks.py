@@ -477,20 +477,18 @@ class CompiledVotes:
 class CompiledStages:
     """The boosted stage 2 in voxels.
 
-    Group g has boxes ``group_start[g]`` to ``group_start[g + 1]``; its statistics are features 5 g to 5 g + 4. A node
-    goes to ``left`` when its feature is at most ``cut``; a negative target ~t is leaf t. Stage s needs the groups
-    before ``stage_groups[s + 1]`` and adds the trees ``stage_trees[s]`` to ``stage_trees[s + 1]``.
+    Group g has boxes ``group_start[g]`` to ``group_start[g + 1]``; its statistics are features 5 g to 5 g + 4. A node is
+    four numbers: feature, cut, and where the nodes for at most the cut and for above it begin. A leaf is a node whose
+    cut is its weight and which leads to itself, so that every path of a tree is ``depth`` steps long. Stage s needs the
+    groups before ``stage_groups[s + 1]`` and adds the trees ``stage_trees[s]`` to ``stage_trees[s + 1]``.
     """
 
     boxes: I32
     group_start: I32
     group_channel: I32
-    feature: I32
-    cut: I64
-    left: I32
-    right: I32
-    leaf: I64
-    root: I32
+    nodes: I64
+    root: I64
+    depth: I32
     stage_groups: I32
     stage_trees: I32
     stage_keep: I64
@@ -629,32 +627,26 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
             "Make them smaller or fewer, or the voxels larger.",
         )
 
-    feature: list[int] = []
-    cut: list[int] = []
-    left: list[int] = []
-    right: list[int] = []
-    leaf: list[int] = []
+    nodes: list[int] = []
 
-    def add(tree: Tree) -> int:
+    def add(tree: Tree) -> tuple[int, int]:
+        """Add a tree; return where its first node begins, and how deep it is."""
+        at = len(nodes)
         if not isinstance(tree, tuple):
-            leaf.append(round(tree * SCORE_UNIT))
-            return ~(len(leaf) - 1)
-        node = len(feature)
+            nodes.extend([0, round(tree * SCORE_UNIT), at, at])
+            return at, 0
         name, share, below, above = tree
         group, _, statistic = name.rpartition(".")
-        feature.append(len(STATISTICS) * index[group] + STATISTICS.index(statistic))
-        cut.append(_floor(round(share * sizes[name], 6)))
-        left.append(0)
-        right.append(0)
-        left[node] = add(below)
-        right[node] = add(above)
-        return node
+        feature = len(STATISTICS) * index[group] + STATISTICS.index(statistic)
+        nodes.extend([feature, _floor(round(share * sizes[name], 6)), 0, 0])
+        (nodes[at + 2], left), (nodes[at + 3], right) = add(below), add(above)
+        return at, 1 + max(left, right)
 
-    root: list[int] = []
+    roots: list[tuple[int, int]] = []
     stage_trees = [0]
     for stage in cascade.stages:
-        root += [add(tree) for tree in stage.trees]
-        stage_trees.append(len(root))
+        roots += [add(tree) for tree in stage.trees]
+        stage_trees.append(len(roots))
     channel = [CHANNELS.index(group.channel) for group, _ in groups]
     first = [stage for _, stage in groups]
     count = len(cascade.stages)
@@ -663,12 +655,9 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
         _box_table(boxes),
         np.array(group_start, dtype=np.int32),
         np.array(channel, dtype=np.int32),
-        np.array(feature, dtype=np.int32),
-        np.array(cut, dtype=np.int64),
-        np.array(left, dtype=np.int32),
-        np.array(right, dtype=np.int32),
-        np.array(leaf, dtype=np.int64),
-        np.array(root, dtype=np.int32),
+        np.array(nodes, dtype=np.int64),
+        np.array([root for root, _ in roots], dtype=np.int64),
+        np.array([depth for _, depth in roots], dtype=np.int32),
         np.array([0, *(sum(f <= s for f in first) for s in range(count))], dtype=np.int32),
         np.array(stage_trees, dtype=np.int32),
         np.array([-_floor(-stage.keep * SCORE_UNIT) for stage in cascade.stages], dtype=np.int64),

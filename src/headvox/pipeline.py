@@ -16,7 +16,7 @@ from headvox.data import F64, Cloud, DepthImage, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import GateTables, gate_columns, margins, padded
+from headvox.gate import GateTables, candidate_reach, gate_columns, margins, padded
 from headvox.integral import integrate
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
@@ -139,8 +139,9 @@ class Detector:
                 merge(memory.cells[0], cells, box, counting)
         span = np.array([min(span[0] for span in spans), max(span[1] for span in spans)])
         occupied_box(memory.cells[0], span, box)
-        box[:3] = np.maximum(box[:3] - memory.reach, 0)
-        box[3:] = np.minimum(box[3:] + memory.reach, np.array(shape) - 1)
+        box += memory.reach
+        box[:3] = np.maximum(box[:3], 0)
+        box[3:] = np.minimum(box[3:], np.array(shape) - 1)
         return box
 
     def _integrate(self, memory: _Memory, box: I64) -> npt.NDArray[Any]:
@@ -300,25 +301,28 @@ class _Memory:
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
         nx, ny, nz = lattice.shape
         self.below, self.above = margins(cascade.gate)
+        if cascade.stages is not None:  # so that a stage, too, looks no box up beyond the ends of a column
+            self.below = max(self.below, -int(cascade.stages.boxes[:, 4].min(initial=0)))
+            self.above = max(self.above, int(cascade.stages.boxes[:, 5].max(initial=0)))
         length = self.below + padded(nz) + self.above + 1
         self.S = np.empty((nx + 1) * (ny + 1) * length, sum_type)
         self.index = np.zeros(nx * ny * length, np.int32)
         self.longer = np.zeros(6, np.int64)
         self.gates = [GateTables.of(cascade.gate, self.S.dtype, nz) for _ in range(threads)]
-        self.reach = int(np.abs(cascade.gate.boxes).max(initial=1))
+        self.reach = candidate_reach(cascade.gate)
         self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
         self.points = np.empty((MOST_PARTS, 3))
         self.seen = np.zeros((1, 1, 2), np.int32)
         self.offsets, self.offset_start = np.empty((0, 3), np.int32), np.zeros(1, np.int32)
         self.tables: tuple[Any, ...] = ()
         self.features = [np.empty(0, np.int64)] * threads
-        self.corners = [np.empty((0, 8), np.int64)] * threads
+        self.corners = [np.empty((0, 8), np.uint64)] * threads
         self.sees = cascade.source.sees
         if cascade.stages is not None:
             boxes, seen_start = seen_boxes(cascade.stages)
             self.offsets, self.offset_start = cells_of(boxes)
             self.tables = stage_tables(cascade.stages, seen_start)
-            self.corners = [np.empty((len(cascade.stages.boxes), 8), np.int64) for _ in range(threads)]
+            self.corners = [np.empty((len(cascade.stages.boxes), 8), np.uint64) for _ in range(threads)]
             self.features = [np.zeros(feature_count(cascade.stages), np.int64) for _ in range(threads)]
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)

@@ -131,18 +131,20 @@ def _sum_at(flat, at, corner, mask):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _descend(tree, features, feature, cut, left, right):  # type: ignore[no-untyped-def]
-    """Return the leaf of ``tree`` that ``features`` lead to."""
-    node = tree
-    while node >= 0:
-        node = left[node] if features[feature[node]] <= cut[node] else right[node]
-    return ~node
+def _leaf(nodes, root, depth, features):  # type: ignore[no-untyped-def]
+    """Return the weight of the leaf of a tree that ``features`` lead to. There is no branch that could be mispredicted."""
+    # Unsigned, because a signed index costs a check for counting from the end.
+    at = np.uint64(root)
+    for _ in range(depth):
+        above = features[np.uint64(nodes[at])] > nodes[at + np.uint64(1)]
+        at = np.uint64(nodes[at + np.uint64(2) + np.uint64(above)])
+    return nodes[at + np.uint64(1)]
 
 
 @kernel
 def vote_stages(  # type: ignore[no-untyped-def]
-    S, cells, seen, first, last, to_stage, boxes, reach, group_start, group_channel, group_ranked, seen_start, feature,
-    cut, left, right, leaf, root, stage_groups, stage_trees, stage_keep, corners, features, scores,
+    S, cells, seen, first, last, to_stage, boxes, reach, group_start, group_channel, group_ranked, seen_start, nodes,
+    root, depth, stage_groups, stage_trees, stage_keep, corners, features, scores,
 ):  # fmt: skip
     """Write the sum of the trees of the first ``to_stage`` stages to ``scores``; DROPPED where a stage says so.
 
@@ -156,7 +158,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
     sums = np.empty(64, np.int64)
     for i in range(first, last):
         x, y, z = np.int64(cells[i, 0]), np.int64(cells[i, 1]), np.int64(cells[i, 2])
-        at = (x * S.shape[1] + y) * S.shape[2] + z
+        at = np.uint64((x * S.shape[1] + y) * S.shape[2] + z)
         inside = (
             x + reach[0] >= 0 and x + reach[1] <= nx and y + reach[2] >= 0 and y + reach[3] <= ny
             and z + reach[4] >= 0 and z + reach[5] <= nz
@@ -176,7 +178,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
                         sums[k] = sum_about(S, x, y, z, boxes[begin + k])
                 _statistics(sums, count, group_ranked[g], features[FEATURES_PER_GROUP * g :])
             for t in range(stage_trees[s], stage_trees[s + 1]):
-                score += leaf[_descend(root[t], features, feature, cut, left, right)]
+                score += _leaf(nodes, root[t], depth[t], features)
             if score < stage_keep[s]:
                 score = DROPPED
                 break
@@ -212,7 +214,7 @@ def score_by_stages(
     seen = np.zeros((len(cells), 1, 2), np.int32) if seen is None else seen
     scores = np.zeros(len(cells), np.int64)
     features = np.zeros(feature_count(stages), np.int64)
-    corners = np.empty((len(stages.boxes), 8), np.int64)
+    corners = np.empty((len(stages.boxes), 8), np.uint64)
     vote_stages(S, cells, seen, 0, len(cells), to_stage, *stage_tables(stages, seen_start), corners, features, scores)
     return scores
 
@@ -222,8 +224,15 @@ def stage_tables(stages: CompiledStages, seen_start: I32) -> tuple[npt.NDArray[A
     looked_up = stages.boxes[np.repeat(stages.group_channel == 0, np.diff(stages.group_start))].astype(np.int64)
     reach = np.array([(looked_up[:, k].min if k % 2 == 0 else looked_up[:, k].max)(initial=0) for k in range(6)])
     ranked = np.zeros(len(stages.group_channel), np.bool_)
-    ranked[stages.feature[stages.feature % FEATURES_PER_GROUP != FEATURES_PER_GROUP - 1] // FEATURES_PER_GROUP] = True
+    features = stages.nodes[0::4][_inner(stages.nodes)]
+    ranked[features[features % FEATURES_PER_GROUP != FEATURES_PER_GROUP - 1] // FEATURES_PER_GROUP] = True
     return (
-        stages.boxes, reach, stages.group_start, stages.group_channel, ranked, seen_start, stages.feature, stages.cut,
-        stages.left, stages.right, stages.leaf, stages.root, stages.stage_groups, stages.stage_trees, stages.stage_keep,
+        stages.boxes, reach, stages.group_start, stages.group_channel, ranked, seen_start, stages.nodes, stages.root,
+        stages.depth, stages.stage_groups, stages.stage_trees, stages.stage_keep,
     )  # fmt: skip
+
+
+def _inner(nodes: I64) -> npt.NDArray[np.bool_]:
+    """Tell which nodes are no leaves: a leaf leads to itself."""
+    inner: npt.NDArray[np.bool_] = nodes[2::4] != np.arange(0, len(nodes), 4)
+    return inner

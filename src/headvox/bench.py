@@ -327,21 +327,22 @@ def _by_box_size(cases: list[Case]) -> Values:
 
 def _memory(detector: Detector, data: Input, frames: int) -> Values:
     """Tell what a frame allocates once everything is there, and whether anything is kept."""
-    for _ in range(3):
-        detector.detect_depth(data.images)
-    gc.collect()
     tracemalloc.start()
-    detector.detect_depth(data.images)
-    before, _ = tracemalloc.get_traced_memory()
-    tracemalloc.reset_peak()
     peaks = []
     for _ in range(5):
+        before, _ = tracemalloc.get_traced_memory()
         tracemalloc.reset_peak()
-        now, _ = tracemalloc.get_traced_memory()
         detector.detect_depth(data.images)
-        peaks.append(tracemalloc.get_traced_memory()[1] - now)
+        peaks.append(tracemalloc.get_traced_memory()[1] - before)
+    gc.collect()
+    before, _ = tracemalloc.get_traced_memory()
+    for _ in range(traced := max(1, frames // 10)):
+        detector.detect_depth(data.images)
+    gc.collect()
     kept = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
+    for _ in range(traced):  # until the memory that the tracing needed is given back
+        detector.detect_depth(data.images)
     resident = _resident_bytes()
     for _ in range(frames):
         detector.detect_depth(data.images)
@@ -349,7 +350,7 @@ def _memory(detector: Detector, data: Input, frames: int) -> Values:
     return {
         "peak_bytes_a_frame": int(np.median(peaks)),
         "image_bytes": sum(image.depth.nbytes for image in data.images),
-        "kept_bytes_a_frame": max(0, kept) // len(peaks),
+        "kept_bytes_a_frame": max(0, kept) // traced,
         "frames": frames,
         "resident_growth_bytes": None if resident is None or after is None else after - resident,
     }

@@ -423,16 +423,6 @@ def fit_spheres(cells: np.ndarray, peaks, voxel: float, subdivision: int) -> np.
     return np.array(rows, np.float64).reshape(-1, 6)
 
 
-def skull_centres(spheres: np.ndarray, origins: np.ndarray, behind: float, above: float) -> np.ndarray:
-    if len(origins) == 0:
-        return spheres
-    moved_centres = []
-    for sphere in spheres:
-        rays = [(sphere - origin) / np.linalg.norm(sphere - origin) for origin in origins]
-        moved_centres.append(sphere + behind * sum(rays) / len(rays) + np.array([0.0, 0.0, above]))
-    return np.array(moved_centres).reshape(-1, 3)
-
-
 # ----------------------------------------------------------------------------------------------------------- all of it
 
 
@@ -481,7 +471,9 @@ def detect(frame: Frame, cascade: Cascade, region: Region, min_score: float | No
     placed = [c.T_world_sensor for c in frame.clouds if c.T_world_sensor is not None]
     placed += [image.T_world_camera for image in frame.depths]
     origins = np.array([T[:3, 3] for T in placed]).reshape(-1, 3)
-    centres = skull_centres(middles + spheres[:, :3], origins, 0.016, 0.006)
+    centres = middles + spheres[:, :3]
+    if len(origins):
+        centres[:, 2] -= 0.0135
     kept = suppress_overlaps(centres, scores[peaks], 0.18)
     return Found(
         centres[kept],

@@ -4,7 +4,7 @@ import pytest
 import scenes
 
 from headvox.data import Cloud
-from headvox.refine import MOST_PARTS, fit_spheres, skull_centres
+from headvox.refine import MOST_PARTS, fit_spheres
 from headvox.voxelize import Lattice, voxelize_points
 
 
@@ -75,18 +75,3 @@ def test_a_full_grid_does_not_overrun_the_memory_for_its_points():
 
 def test_no_peak():
     assert fitted(np.zeros((3, 3, 3), np.uint8), np.empty((0, 3))).shape == (0, 6)
-
-
-@pytest.mark.parametrize("sensors", [0, 1, 3])
-def test_skull_centres_equal_the_naive_twin(sensors):
-    rng = np.random.default_rng(sensors)
-    spheres, origins = rng.normal(size=(5, 3)), rng.normal(size=(sensors, 3))
-    moved = skull_centres(spheres, origins, 0.016, 0.006)
-    np.testing.assert_allclose(moved, naive.skull_centres(spheres, origins, 0.016, 0.006), atol=1e-12)
-
-
-def test_a_skull_lies_behind_its_seen_side():
-    moved = skull_centres(np.array([[2.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 1.0]]), 0.016, 0.006)
-    np.testing.assert_allclose(moved, [[2.016, 0.0, 1.006]])
-    at_sensor = skull_centres(np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 1.0]]), 0.016, 0.006)
-    np.testing.assert_allclose(at_sensor, [[0.0, 0.0, 1.006]])

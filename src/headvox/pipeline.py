@@ -20,19 +20,27 @@ from headvox.gate import GateTables, candidate_reach, gate_columns, margins, pad
 from headvox.integral import integrate
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
-from headvox.refine import MOST_PARTS, fit_spheres, skull_centres
+from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
 from headvox.suppress import local_maxima, suppress_overlaps
 from headvox.visibility import camera_table, cells_of, count_states, look_about
 from headvox.vote import DROPPED, feature_count, seen_boxes, stage_tables, vote_masks, vote_stages
-from headvox.voxelize import Lattice, Rays, clear, mark_depth, mark_points, merge, new_span, occupied_box, part_transform
+from headvox.voxelize import (
+    Lattice,
+    Rays,
+    clear,
+    mark_depth,
+    mark_points,
+    merge,
+    new_span,
+    occupied_box,
+    part_transform,
+)
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
 SAME_HEAD_M = 0.18
-BEHIND_M = 0.016
-ABOVE_M = 0.006
 
 
 class Detector:
@@ -76,7 +84,9 @@ class Detector:
         Raises:
             HeadvoxError: an image that does not fit its camera, a transform that is not rigid, or no return in range.
         """
-        return self.detect_frame(Frame(0, depths=(images,) if isinstance(images, DepthImage) else tuple(images)))
+        return self.detect_frame(
+            Frame(0, depths=(images,) if isinstance(images, DepthImage) else tuple(images))
+        )
 
     def detect_frame(self, frame: Frame) -> Heads:
         """Return the heads in everything that the sensors saw at one moment."""
@@ -125,7 +135,18 @@ class Detector:
                 rays = self._rays_of(image, lattice)
                 low, high = _share(len(image.depth), part, parts)
                 mark_depth(
-                    image.depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting, span, cells
+                    image.depth,
+                    low,
+                    high,
+                    rays.column,
+                    rays.row,
+                    rays.t,
+                    limits,
+                    shape,
+                    shift,
+                    counting,
+                    span,
+                    cells,
                 )
 
         self._threads.run(mark, [(part,) for part in range(parts)])
@@ -210,13 +231,23 @@ class Detector:
             states = np.zeros((len(cells), len(memory.offsets)), np.uint8)
             in_lattice = cells + memory.longer[:3].astype(np.int32)
             for image in frame.depths:
-                look_about(image.depth, camera_table(image, memory.lattice), in_lattice, memory.offsets, states)
+                look_about(
+                    image.depth, camera_table(image, memory.lattice), in_lattice, memory.offsets, states
+                )
             seen = np.empty((len(cells), len(memory.offset_start) - 1, 2), np.int32)
             count_states(states, memory.offset_start, seen)
             judged = np.empty(len(cells), np.int64)
             vote_stages(
-                S, cells, seen, 0, len(cells), len(stages.stage_keep), *memory.tables, memory.corners[0],
-                memory.features[0], judged,
+                S,
+                cells,
+                seen,
+                0,
+                len(cells),
+                len(stages.stage_keep),
+                *memory.tables,
+                memory.corners[0],
+                memory.features[0],
+                judged,
             )
             scores[peaks] = judged
         least = self.config.min_score
@@ -224,9 +255,7 @@ class Detector:
             least = cascade.min_score if sees or not memory.sees else cascade.min_score_occupied
         return peaks[scores[peaks] >= math.ceil(least * SCORE_UNIT)], scores
 
-    def _refine(
-        self, frame: Frame, cells: I32, scores: I64, peaks: I64, memory: _Memory
-    ) -> Heads:
+    def _refine(self, frame: Frame, cells: I32, scores: I64, peaks: I64, memory: _Memory) -> Heads:
         count = len(cells)
         if count == 0:
             return Heads()
@@ -240,7 +269,9 @@ class Detector:
             fit_spheres(
                 memory.cells[0], cells, lattice.voxel_m, lattice.subdivision, counting, memory.points, spheres
             )
-            centres = skull_centres(centres + spheres[:, :3], _origins(frame), BEHIND_M, ABOVE_M)
+            centres = centres + spheres[:, :3]
+            if len(_origins(frame)):
+                centres[:, 2] -= HAIR_M
             radii = spheres[:, 3]
         kept = suppress_overlaps(centres, scores, SAME_HEAD_M)
         quaternions = np.full((count, 4), np.nan)
@@ -365,12 +396,16 @@ def _origins(frame: Frame) -> F64:
 
 def _check_frame(frame: Frame) -> None:
     if not frame.clouds and not frame.depths:
-        raise HeadvoxError("The frame has neither points nor depth images.", "Give at least one sensor's reading.")
+        raise HeadvoxError(
+            "The frame has neither points nor depth images.", "Give at least one sensor's reading."
+        )
     for cloud in frame.clouds:
         points = cloud.points
         if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
             shape = getattr(points, "shape", type(points).__name__)
-            raise HeadvoxError(f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them.")
+            raise HeadvoxError(
+                f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them."
+            )
         if points.dtype != np.float32 or not points.flags.c_contiguous:
             raise HeadvoxError(
                 f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype} in strides {points.strides}.",
@@ -393,7 +428,9 @@ def _check_frame(frame: Frame) -> None:
                 "Give the intrinsics of this image size.",
             )
         if not (camera.fx > 0 and camera.fy > 0 and camera.depth_scale > 0):
-            raise HeadvoxError(f"{image.name}: fx, fy and depth_scale must be above 0.", "Check the intrinsics.")
+            raise HeadvoxError(
+                f"{image.name}: fx, fy and depth_scale must be above 0.", "Check the intrinsics."
+            )
         as_rigid(image.T_world_camera, f"{image.name}: T_world_camera")
 
 
@@ -418,7 +455,9 @@ def _nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
             "Set centre, max_range_m, min_height_m or max_height_m, or give the sensor's transform.",
         )
     if all(not image.depth.any() for image in frame.depths):
-        return HeadvoxError(f"{frame.depths[0].name}: the depth image has no return at all.", "Is the sensor running?")
+        return HeadvoxError(
+            f"{frame.depths[0].name}: the depth image has no return at all.", "Is the sensor running?"
+        )
     return HeadvoxError(
         f"{frame.depths[0].name}: no return is {where} and between {region.min_height_m:g} m and "
         f"{region.max_height_m:g} m high.",

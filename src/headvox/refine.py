@@ -9,9 +9,7 @@ of the sphere, along the ray, and a little above it.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from headvox.data import F64
 from headvox.kernels import kernel, rule
 
 REACH_M = 0.16
@@ -21,6 +19,7 @@ RADIUS_SIGMA_M = 0.008
 CENTRE_SIGMA_M = 0.05
 SURFACE_SIGMA_M = 0.012
 STEPS = 10
+HAIR_M = 0.0135  # the median over 710 simulated heads, with one camera (553) and with several alike
 MOST_PARTS = 8192
 
 
@@ -122,17 +121,3 @@ def fit_spheres(cells, peaks, voxel_m, subdivision, counting, points, spheres): 
             rms = np.sqrt(squares / max(weights, 1e-9))
         spheres[i, 0], spheres[i, 1], spheres[i, 2] = cx, cy, cz
         spheres[i, 3], spheres[i, 4], spheres[i, 5] = r, rms, count
-
-
-def skull_centres(spheres: F64, origins: npt.NDArray[np.float64], behind_m: float, above_m: float) -> F64:
-    """Return the centres (N, 3) of the skulls whose seen side the spheres (N, 3) follow.
-
-    Each is moved by ``behind_m`` along the mean direction from the sensors at ``origins`` (S, 3) and by ``above_m``
-    upwards. Without sensors, or with sensors all around, the spheres are not moved along any ray.
-    """
-    if len(origins) == 0:
-        return spheres
-    rays = spheres[:, None, :] - origins[None, :, :]
-    rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-9)
-    moved: F64 = spheres + behind_m * rays.mean(axis=1) + np.array([0.0, 0.0, above_m])
-    return moved

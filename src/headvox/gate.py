@@ -44,7 +44,7 @@ def _column_sums(S, x, y, box, weight, bottom, out, adding):  # type: ignore[no-
 def gate_columns(  # type: ignore[no-untyped-def]
     S, first, last, bottom, top, boxes, weights, start, rank, limits, least, sums, alive, survivors
 ):
-    """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many there are.
+    """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many.
 
     Only voxels from ``bottom`` to ``top`` count; about them, no box may leave S in z. ``least`` is x0 x1 y0 y1 and a
     count: a window that holds fewer in the whole column cannot pass, whatever z. ``sums`` and ``alive``, a whole number
@@ -145,7 +145,9 @@ def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
         if after - first == 1 and gate.weights[first] > 0 and low > 0
     ]
     widest = np.array([-1, -1, -1, 1, 1, 1]) * np.abs(gate.boxes).max(initial=1)
-    reach = min(reaches, key=lambda reach: int((reach[3:] - reach[:3]).sum()), default=widest).astype(np.int64)
+    reach = min(reaches, key=lambda reach: int((reach[3:] - reach[:3]).sum()), default=widest).astype(
+        np.int64
+    )
     return np.concatenate([np.minimum(reach[:3], 0), np.maximum(reach[3:], 0)])
 
 

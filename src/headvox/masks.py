@@ -477,10 +477,10 @@ class CompiledVotes:
 class CompiledStages:
     """The boosted stage 2 in voxels.
 
-    Group g has boxes ``group_start[g]`` to ``group_start[g + 1]``; its statistics are features 5 g to 5 g + 4. A node is
-    four numbers: feature, cut, and where the nodes for at most the cut and for above it begin. A leaf is a node whose
-    cut is its weight and which leads to itself, so that every path of a tree is ``depth`` steps long. Stage s needs the
-    groups before ``stage_groups[s + 1]`` and adds the trees ``stage_trees[s]`` to ``stage_trees[s + 1]``.
+    Group g has boxes ``group_start[g]`` to ``group_start[g + 1]``; its statistics are features 5 g to 5 g + 4. A node
+    is four numbers: feature, cut, and where the nodes for at most the cut and for above it begin. A leaf is a node
+    whose cut is its weight and which leads to itself, so that every path of a tree is ``depth`` steps long. Stage s
+    needs the groups before ``stage_groups[s + 1]`` and adds the trees ``stage_trees[s]`` to ``stage_trees[s + 1]``.
     """
 
     boxes: I32

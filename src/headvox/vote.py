@@ -77,7 +77,15 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
     """
     scores = np.empty(len(cells), np.int64)
     best_yaw = np.zeros(len(cells), np.int32)
-    table = (votes.boxes, votes.weights, votes.start, votes.masks, votes.pairs, votes.asymmetry_cost, votes.min_votes)
+    table = (
+        votes.boxes,
+        votes.weights,
+        votes.start,
+        votes.masks,
+        votes.pairs,
+        votes.asymmetry_cost,
+        votes.min_votes,
+    )
     vote_masks(S, cells, 0, len(cells), *table, scores, best_yaw)
     return scores, best_yaw
 
@@ -87,7 +95,7 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
 
 @rule
 def _statistics(sums, count, ranked, out):  # type: ignore[no-untyped-def]
-    """Write smallest, 3rd smallest, 3rd largest and largest of ``sums`` (if ``ranked``; it sorts them) and their total."""
+    """Write smallest, 3rd smallest, 3rd largest and largest of ``sums`` (if ``ranked``: sorts them) and the total."""
     total = sums[0]
     for i in range(1, count):
         total += sums[i]
@@ -132,7 +140,7 @@ def _sum_at(flat, at, corner, mask):  # type: ignore[no-untyped-def]
 
 @rule
 def _leaf(nodes, root, depth, features):  # type: ignore[no-untyped-def]
-    """Return the weight of the leaf of a tree that ``features`` lead to. There is no branch that could be mispredicted."""
+    """Return the weight of the leaf of a tree that ``features`` lead to, without any branch to mispredict."""
     # Unsigned, because a signed index costs a check for counting from the end.
     at = np.uint64(root)
     for _ in range(depth):
@@ -180,7 +188,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
             for t in range(stage_trees[s], stage_trees[s + 1]):
                 score += _leaf(nodes, root[t], depth[t], features)
             if score < stage_keep[s]:
-                score = DROPPED
+                score = np.int64(DROPPED)
                 break
         scores[i] = score
 
@@ -201,9 +209,7 @@ def feature_count(stages: CompiledStages) -> int:
     return FEATURES_PER_GROUP * len(stages.group_channel)
 
 
-def score_by_stages(
-    S: Integral, cells: I32, stages: CompiledStages, seen: I32 | None = None
-) -> I64:
+def score_by_stages(S: Integral, cells: I32, stages: CompiledStages, seen: I32 | None = None) -> I64:
     """Return each candidate's score, in units of 1/1024; DROPPED where a stage dropped it.
 
     Without ``seen`` (candidates, boxes, 2; see :func:`headvox.visibility.count_seen`) the stages that need the
@@ -215,14 +221,20 @@ def score_by_stages(
     scores = np.zeros(len(cells), np.int64)
     features = np.zeros(feature_count(stages), np.int64)
     corners = np.empty((len(stages.boxes), 8), np.uint64)
-    vote_stages(S, cells, seen, 0, len(cells), to_stage, *stage_tables(stages, seen_start), corners, features, scores)
+    vote_stages(
+        S, cells, seen, 0, len(cells), to_stage, *stage_tables(stages, seen_start), corners, features, scores
+    )
     return scores
 
 
 def stage_tables(stages: CompiledStages, seen_start: I32) -> tuple[npt.NDArray[Any], ...]:
     """Return the tables of ``stages`` in the order of :func:`vote_stages`."""
-    looked_up = stages.boxes[np.repeat(stages.group_channel == 0, np.diff(stages.group_start))].astype(np.int64)
-    reach = np.array([(looked_up[:, k].min if k % 2 == 0 else looked_up[:, k].max)(initial=0) for k in range(6)])
+    looked_up = stages.boxes[np.repeat(stages.group_channel == 0, np.diff(stages.group_start))].astype(
+        np.int64
+    )
+    reach = np.array(
+        [(looked_up[:, k].min if k % 2 == 0 else looked_up[:, k].max)(initial=0) for k in range(6)]
+    )
     ranked = np.zeros(len(stages.group_channel), np.bool_)
     features = stages.nodes[0::4][_inner(stages.nodes)]
     ranked[features[features % FEATURES_PER_GROUP != FEATURES_PER_GROUP - 1] // FEATURES_PER_GROUP] = True

@@ -195,7 +195,7 @@ def mark_depth(depth, first, last, column, row, t, limits, shape, shift, countin
 @kernel
 def occupied_box(cells, span, box):  # type: ignore[no-untyped-def]
     """Write to ``box`` the lowest and highest occupied cell in x, y, z; the codes in ``cells`` lie within ``span``."""
-    nx, ny, nz = cells.shape
+    _, ny, nz = cells.shape
     box[0], box[3] = (span[0] >> 3) // (ny * nz), (span[1] >> 3) // (ny * nz)
     box[1], box[4] = ny, -1
     over = np.zeros(nz, np.uint8)

@@ -30,7 +30,9 @@ def test_it_measures_all_that_it_promises(result):
     for row in result["ms"].values():
         assert 0 < row["p50"] <= row["p99"]
         assert row["calls"] >= 1
-        assert math.isclose(row["times_the_copy"], row["p50"] / result["ms"][bench.COPY]["p50"], rel_tol=1e-3, abs_tol=0.01)
+        assert math.isclose(
+            row["times_the_copy"], row["p50"] / result["ms"][bench.COPY]["p50"], rel_tol=1e-3, abs_tol=0.01
+        )
     for case in CASES:
         assert [*result["stages_ms"][case]] == list(STAGES)
         assert result["ms"][case]["heads"] >= 0

@@ -1,7 +1,7 @@
 """What README and docs say is tried out: every command, every piece of Python, every link, every piece of JSON.
 
-The commands of a document run in its order in one folder that holds ``recording`` (the sample that ships with headvox)
-and ``cloud.ply`` (its first frame).
+The commands of a document run in its order in one folder that holds ``recording`` (the beginning of the sample that
+ships with headvox) and ``cloud.ply`` (its first frame).
 """
 
 from __future__ import annotations
@@ -49,6 +49,9 @@ def commands(document: Path) -> list[str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     shutil.copytree(SAMPLE, folder / "recording")
+    description = json.loads((SAMPLE / "recording.json").read_text("utf-8"))
+    description["frames"] = description["frames"][:4]
+    (folder / "recording" / "recording.json").write_text(json.dumps(description))
     frame = next(iter(headvox.open_source(SAMPLE)))
     points = np.concatenate([unproject(i.depth, i.intrinsics, i.T_world_camera) for i in frame.depths])
     (folder / "cloud.ply").write_bytes(ply_bytes(points))

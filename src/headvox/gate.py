@@ -27,17 +27,17 @@ def _column_sums(S, x, y, box, weight, bottom, out, adding):  # type: ignore[no-
     nx, ny, length = S.shape[0] - 1, S.shape[1] - 1, out.shape[0]
     x0, x1 = min(max(x + box[0], 0), nx), min(max(x + box[1], 0), nx)
     y0, y1 = min(max(y + box[2], 0), ny), min(max(y + box[3], 0), ny)
-    low, high = bottom + box[4], bottom + box[5]
-    a, b = S[x1, y1, high : high + length], S[x0, y1, high : high + length]
-    c, d = S[x1, y0, high : high + length], S[x0, y0, high : high + length]
-    e, f = S[x1, y1, low : low + length], S[x0, y1, low : low + length]
-    g, h = S[x1, y0, low : low + length], S[x0, y0, low : low + length]
+    a, b, c, d = S[x1, y1], S[x0, y1], S[x1, y0], S[x0, y0]
+    # Unsigned, because a signed index costs a check for counting from the end, and the loop its vectors.
+    low, high = np.uint64(bottom + box[4]), np.uint64(bottom + box[5])
     if adding:
-        for z in range(length):
-            out[z] += weight * (((a[z] - b[z]) - (c[z] - d[z])) - ((e[z] - f[z]) - (g[z] - h[z])))
+        for z in range(np.uint64(length)):
+            i, j = z + high, z + low
+            out[z] += weight * (((a[i] - b[i]) - (c[i] - d[i])) - ((a[j] - b[j]) - (c[j] - d[j])))
     else:
-        for z in range(length):
-            out[z] = weight * (((a[z] - b[z]) - (c[z] - d[z])) - ((e[z] - f[z]) - (g[z] - h[z])))
+        for z in range(np.uint64(length)):
+            i, j = z + high, z + low
+            out[z] = weight * (((a[i] - b[i]) - (c[i] - d[i])) - ((a[j] - b[j]) - (c[j] - d[j])))
 
 
 @kernel

@@ -41,6 +41,7 @@ I64 = npt.NDArray[np.int64]
 
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
 SAME_HEAD_M = 0.18
+MOST_PEAKS = 256
 
 
 class Detector:
@@ -217,8 +218,10 @@ class Detector:
     def _suppress(self, S: npt.NDArray[Any], survivors: I32, scores: I64, memory: _Memory) -> I64:
         shape = tuple(n - 1 for n in S.shape)
         index = memory.index[: math.prod(shape)].reshape(shape)
-        found = local_maxima(survivors, scores, DROPPED + 1, index, memory.peaks)
-        return memory.peaks[:found]
+        peaks = memory.peaks[: local_maxima(survivors, scores, DROPPED + 1, index, memory.peaks)]
+        if len(peaks) > MOST_PEAKS:  # a frame of noise: what follows must not take forever
+            peaks = np.sort(peaks[np.argsort(-scores[peaks], kind="stable")[:MOST_PEAKS]])
+        return peaks
 
     def _judge(
         self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: _Memory

@@ -159,6 +159,24 @@ def test_the_columns_of_a_csv_file_are_told() -> None:
     assert ", ".join(COLUMNS) in text
 
 
+def test_the_numbers_are_those_of_the_code() -> None:
+    from headvox import pipeline, refine
+    from headvox.config import DetectorConfig
+
+    how = " ".join((ROOT / "docs" / "how-it-works.md").read_text("utf-8").split())
+    assert refine.STEPS == 10
+    for told in (
+        f"{100 * refine.HAIR_M:g} cm below",
+        f"at most {100 * refine.REACH_M:g} cm",
+        f"closer than {100 * pipeline.SAME_HEAD_M:g} cm",
+        *(f"| {stage} |" for stage in pipeline.STAGES),
+    ):
+        assert told in how
+    config, readme = DetectorConfig(), " ".join((ROOT / "README.md").read_text("utf-8").split())
+    low, high, far = config.min_height_m, config.max_height_m, config.max_range_m
+    assert f"{-low:g} m below and {high:g} m above z = 0, within {far:g} m" in readme
+
+
 def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs" / "pictures").iterdir())
     assert {"sample.gif", "cascade-default.png", "cascade-paper.png"} <= {path.name for path in pictures}

@@ -30,6 +30,7 @@ def test_it_measures_all_that_it_promises(result):
     for row in result["ms"].values():
         assert 0 < row["p50"] <= row["p99"]
         assert row["calls"] >= 1
+        assert row["cold_p50"] > 0
         assert math.isclose(
             row["times_the_copy"], row["p50"] / result["ms"][bench.COPY]["p50"], rel_tol=1e-3, abs_tol=0.01
         )

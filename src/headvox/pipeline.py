@@ -27,7 +27,6 @@ from headvox.vote import DROPPED, feature_count, seen_boxes, stage_tables, vote_
 from headvox.voxelize import (
     Lattice,
     Rays,
-    clear,
     mark_depth,
     mark_points,
     merge,
@@ -94,7 +93,7 @@ class Detector:
         _check_frame(frame)
         clock = _Clock(self.stage_ms)
         memory = self._memory_for(frame)
-        memory.in_use = True
+        memory.clear()
         box = self._voxelize(frame, memory)
         clock.done("voxelize")
         S = self._integrate(memory, box)
@@ -109,8 +108,6 @@ class Detector:
         clock.done("judge")
         heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, memory)
         clock.done("refine")
-        clear(memory.cells[0], box)
-        memory.in_use = False
         return heads
 
     def close(self) -> None:
@@ -152,15 +149,15 @@ class Detector:
 
         self._threads.run(mark, [(part,) for part in range(parts)])
         if all(span[1] < 0 for span in spans):
-            memory.in_use = False
+            memory.dirty = (0, 0)
             raise _nothing_in_range(frame, lattice.region)
         box = np.empty(6, np.int64)
-        for cells, span in zip(memory.cells[1:], spans[1:], strict=True):
+        for flat, span in zip(memory.flat[1:], spans[1:], strict=True):
             if span[1] >= 0:
-                occupied_box(cells, span, box)
-                merge(memory.cells[0], cells, box, counting)
+                merge(memory.flat[0], flat, span, counting)
         span = np.array([min(span[0] for span in spans), max(span[1] for span in spans)])
         occupied_box(memory.cells[0], span, box)
+        memory.dirty = (int(box[0]), int(box[3]) + 1)
         box += memory.reach
         box[:3] = np.maximum(box[:3], 0)
         box[3:] = np.minimum(box[3:], np.array(shape) - 1)
@@ -288,8 +285,6 @@ class Detector:
     def _memory_for(self, frame: Frame) -> _Memory:
         """Return the working memory, made anew only when the region moved."""
         region = self._region(frame)
-        if self._memory is not None and self._memory.in_use:
-            self._memory = None  # a frame was interrupted midway, and has left something behind
         if self._memory is None or self._memory.lattice.region != region:
             lattice = Lattice.over(region, self.cascade.voxel_m, self.cascade.source.subdivision)
             if self._memory is None or self._memory.lattice.shape != lattice.shape:
@@ -330,7 +325,7 @@ class _Memory:
         sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
         cells = math.prod(lattice.shape)
         self.place(lattice)
-        self.in_use = False
+        self.dirty: tuple[int, int] | None = (0, 0)
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
         nx, ny, nz = lattice.shape
@@ -360,6 +355,15 @@ class _Memory:
             self.features = [np.zeros(feature_count(cascade.stages), np.int64) for _ in range(threads)]
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
+
+    def clear(self) -> None:
+        """Empty the grid of the last frame. Now, not when it ended: so the cells are in the cache when they are marked."""
+        if self.dirty is None:  # a frame was interrupted midway, and has left something anywhere
+            for cells in self.cells:
+                cells[:] = 0
+        else:
+            self.cells[0][self.dirty[0] : self.dirty[1]] = 0
+        self.dirty = None
 
     def place(self, lattice: Lattice) -> None:
         """Stand for another region of the same shape."""

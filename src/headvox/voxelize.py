@@ -159,15 +159,23 @@ def _code_depth_row(line, column, row_x, row_y, row_z, t, limits, shape, shift, 
 
 @kernel
 def _mark(codes, counting, cells):  # type: ignore[no-untyped-def]
-    """Enter coded points into the flat grid."""
+    """Enter coded points into the flat grid; ``codes`` is used up.
+
+    What lies nowhere is taken out first, without a branch: whether a point is kept is nothing a processor can guess.
+    Indices are unsigned, because a signed one costs a check for counting from the end.
+    """
+    kept = np.uint64(0)
+    for i in range(codes.shape[0]):
+        code = codes[i]
+        codes[kept] = code
+        kept += np.uint64(code >= 0)
     if counting:
-        for code in codes:
-            if code >= 0:
-                cells[code >> 3] += 1
+        for i in range(kept):
+            cells[np.uint32(codes[i]) >> np.uint32(3)] += 1
     else:
-        for code in codes:
-            if code >= 0:
-                cells[code >> 3] |= 1 << (code & 7)
+        for i in range(kept):
+            code = np.uint32(codes[i])
+            cells[code >> np.uint32(3)] |= np.uint8(1) << (code & np.uint32(7))
 
 
 @kernel
@@ -218,23 +226,17 @@ def occupied_box(cells, span, box):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def merge(cells, other, box, counting):  # type: ignore[no-untyped-def]
-    """Add the cells that another thread marked, all within ``box``, and clear them there."""
-    for x in range(box[0], box[3] + 1):
-        for y in range(box[1], box[4] + 1):
-            mine = cells[x, y, box[2] : box[5] + 1]
-            theirs = other[x, y, box[2] : box[5] + 1]
-            for z in range(mine.shape[0]):
-                mine[z] = mine[z] + theirs[z] if counting else mine[z] | theirs[z]
-                theirs[z] = 0
-
-
-@kernel
-def clear(cells, box):  # type: ignore[no-untyped-def]
-    """Empty the cells within ``box``."""
-    for x in range(box[0], box[3] + 1):
-        for y in range(box[1], box[4] + 1):
-            cells[x, y, box[2] : box[5] + 1] = 0
+def merge(cells, other, span, counting):  # type: ignore[no-untyped-def]
+    """Add what another thread marked within ``span`` of the flat grid, and clear it there."""
+    first, last = span[0] >> 3, (span[1] >> 3) + 1
+    mine, theirs = cells[first:last], other[first:last]
+    if counting:
+        for i in range(mine.shape[0]):
+            mine[i] += theirs[i]
+    else:
+        for i in range(mine.shape[0]):
+            mine[i] |= theirs[i]
+    theirs[:] = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,6 +43,7 @@ examples:
   headvox run recording/ --json                one JSON object a frame
   headvox run recording/ -o heads.csv          one row a head
   headvox config --max-range 4 > my.toml       settings to keep, for --config my.toml
+  headvox synth two-cameras -o rig             a recording of synthetic people, with their true heads
 
 exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 130 Ctrl-C
 """
@@ -69,12 +70,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    if arguments and arguments[0] in MODULES:
-        module = importlib.import_module(MODULES[arguments[0]][0])
-        return int(module.main([argument for argument in arguments[1:] if argument != "--debug"]) or GOOD)
-    parser = _parser()
     try:
-        args = parser.parse_args(arguments)
+        if arguments and arguments[0] in MODULES:
+            module = importlib.import_module(MODULES[arguments[0]][0])
+            return int(module.main([argument for argument in arguments[1:] if argument != "--debug"]) or GOOD)
+        args = _parser().parse_args(arguments)
     except SystemExit as done:  # after --help, --version or wrong usage
         return int(done.code or GOOD)
     try:

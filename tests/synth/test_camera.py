@@ -36,6 +36,19 @@ def test_depth_noise_follows_its_formula(distance_m):
     assert np.mean(spread) == pytest.approx(theory, rel=0.15)
 
 
+@pytest.mark.parametrize("distance_m", [1.0, 2.0, 3.0, 4.0])
+def test_the_d435i_preset_as_a_whole_keeps_to_the_formula(distance_m):
+    sensor, intrinsics = d435i(), lens("d435i")
+    spread = []
+    for frame in range(2):
+        view = flat_wall(distance_m, albedo=0.6, shape=(480, 848))
+        depth = measure(view, intrinsics, sensor, *generators(frame))[40:-40, 40:-40] * intrinsics.depth_scale
+        assert (depth == 0.0).mean() < 0.005
+        spread.append(depth[depth > 0.0].std())
+    theory = distance_m**2 * sensor.noise_px / (intrinsics.fx * sensor.baseline_m)
+    assert np.mean(spread) == pytest.approx(theory, rel=0.06)
+
+
 def test_noise_is_shared_by_neighbours_but_not_across_the_image():
     field = noise_field(np.random.default_rng(0), (200, 300), 3.0)
     assert field.std() == pytest.approx(1.0, rel=0.15)

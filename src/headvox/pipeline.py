@@ -357,7 +357,7 @@ class _Memory:
         self.make_room(4096)
 
     def clear(self) -> None:
-        """Empty the grid of the last frame. Now, not when it ended: so the cells are in the cache when they are marked."""
+        """Empty the grid of the last frame: now, so that the cells are in the cache when they are marked."""
         if self.dirty is None:  # a frame was interrupted midway, and has left something anywhere
             for cells in self.cells:
                 cells[:] = 0

@@ -140,6 +140,7 @@ def _run(args: argparse.Namespace) -> int:
         from headvox.run import run
         from headvox.sinks.jsonl import JsonStream
         from headvox.sinks.summary import summary
+        from headvox.sources.recording import RecordingSource
         from headvox.warmup import warm_up
 
         live = stack.enter_context(closing(Live(sys.stderr, source.length)))
@@ -153,7 +154,7 @@ def _run(args: argparse.Namespace) -> int:
             sinks.append(stack.enter_context(closing(open_sink(args.output))))
         if args.json:
             sinks.append(JsonStream(sys.stdout))
-        live.show("getting ready (the first time compiles, for about half a minute)")
+        live.show("getting ready (the first time compiles, ten seconds or more)")
         warm_up(config)
         report = run(
             source,
@@ -164,6 +165,8 @@ def _run(args: argparse.Namespace) -> int:
             on_bad=lambda index, reason: live.note(f"headvox: frame {index} skipped: {reason}"),
             on_frame=live.frame,
         )
+        if report.heads == 0 and not report.interrupted and not isinstance(source, RecordingSource):
+            live.note("no head in any frame: headvox expects metres, and a world whose z points up")
     if not args.json:
         print(summary(report))
     return INTERRUPTED if report.interrupted else GOOD

@@ -17,7 +17,7 @@ CLEAN = replace(IDEAL, baseline_m=0.05)
 def flat_wall(distance_m, albedo=0.5, shape=(240, 320)):
     """A wall square to the axis, seen everywhere under a right angle."""
     full = np.full(shape, 1.0, np.float32)
-    return View(full * distance_m, np.zeros(shape, np.int32), full * albedo, full)
+    return View(full * distance_m, np.zeros(shape, np.int32), full * albedo, full, 0 * full)
 
 
 def generators(frame=0):
@@ -156,3 +156,30 @@ def test_an_unknown_lens_is_named_an_error():
 
     with pytest.raises(HeadvoxError, match="d435i-vga"):
         lens("zed")
+
+
+def test_a_highlight_blinds_only_what_faces_the_camera():
+    sensor = replace(CLEAN, name="weak", weak=0.02, noise_px=0.01)
+    lens = Intrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
+
+    def lost(gloss, cosine):
+        wall = flat_wall(1.5)
+        wall = replace(wall, gloss=wall.gloss + np.float32(gloss), cosine=wall.cosine * np.float32(cosine))
+        return np.mean(measure(wall, lens, sensor, np.random.default_rng(0), np.random.default_rng(1)) == 0)
+
+    assert lost(0.0, 1.0) == 0.0
+    assert lost(0.5, 1.0) > 0.5
+    assert lost(0.5, np.cos(np.radians(25))) < 0.01
+    assert lost(0.5, np.cos(np.radians(45))) == 0.0
+
+
+def test_glossy_hair_returns_less_than_matt_hair_of_the_same_albedo():
+    sensor = replace(CLEAN, name="weak", weak=0.1, noise_px=0.01)
+    lens = Intrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
+    matt = replace(flat_wall(4.0, albedo=0.09), cosine=np.full((240, 320), 0.8, np.float32))
+    glossy = replace(matt, gloss=np.full((240, 320), 0.6, np.float32))
+    holes = [
+        np.mean(measure(wall, lens, sensor, np.random.default_rng(0), np.random.default_rng(1)) == 0)
+        for wall in (matt, glossy)
+    ]
+    assert holes[1] > holes[0] + 0.2

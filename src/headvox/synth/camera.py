@@ -19,6 +19,8 @@ from headvox.synth.rays import NOTHING, ROOM_ID, Mesh, View, spin
 Mask = npt.NDArray[np.bool_]
 Shape = tuple[int, int]
 
+HIGHLIGHT_LEAST = 0.35  # the gloss from which a highlight can blind a pixel that faces the camera
+HIGHLIGHT_SLOPE = 12.0  # how fast that fades with the angle: at gloss 0.6 it is gone at 12 degrees
 SIGNAL_REFERENCE_M = 4.0
 
 
@@ -245,15 +247,20 @@ def without_slits(hole: Mask) -> Mask:
 def weak_returns(
     view: View, weak: float, hole_px: float, lasting: np.random.Generator, rng: np.random.Generator
 ) -> Mask:
-    """Pixels whose light comes back too weak: dark, slanted or far surfaces, in blobs."""
+    """Pixels whose light comes back too weak, in blobs: dark, slanted, far or glossy surfaces.
+
+    What a glossy surface mirrors is lost, but where it faces the camera: there the highlight blinds the pixel.
+    """
     if weak <= 0.0:
         return np.zeros(view.ids.shape, np.bool_)
     with np.errstate(divide="ignore", invalid="ignore"):
-        signal = (view.albedo / 0.5) * view.cosine * (SIGNAL_REFERENCE_M / view.distance_m) ** 2
+        scattered = view.albedo * (1.0 - view.gloss)
+        signal = (scattered / 0.5) * view.cosine * (SIGNAL_REFERENCE_M / view.distance_m) ** 2
         strength = np.log(signal / weak)
     shape = view.ids.shape
     blobs = 0.45 * noise_field(lasting, shape, hole_px) + 0.25 * noise_field(rng, shape, 0.6 * hole_px)
-    return without_slits(~(strength + blobs > 0.0) & (view.ids != NOTHING))
+    dazzled = view.gloss * (1.0 + blobs) > HIGHLIGHT_SLOPE * (1.0 - view.cosine) + HIGHLIGHT_LEAST
+    return without_slits((~(strength + blobs > 0.0) | dazzled) & (view.ids != NOTHING))
 
 
 def ragged_edges(

@@ -29,13 +29,19 @@ class Mesh:
     """Triangles in the world frame.
 
     ``vertices`` (V, 3) float64 metres; ``faces`` (F, 3) int32; ``albedo`` (F,) float32, the share of infrared
-    light a face sends back, 0..1; ``ids`` (F,) int32, whose face it is.
+    light a face sends back, 0..1; ``ids`` (F,) int32, whose face it is; ``gloss`` (F,) float32, the share of what it
+    sends back that it mirrors instead of scattering, 0..1, by default nothing.
     """
 
     vertices: F64
     faces: I32
     albedo: F32
     ids: I32
+    gloss: F32 | None = None
+
+    def glosses(self) -> F32:
+        """Return the gloss of every face."""
+        return np.zeros(len(self.faces), np.float32) if self.gloss is None else self.gloss
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +50,14 @@ class View:
 
     ``distance_m`` float32, along the optical axis for a camera and along the ray for a LiDAR, infinite where
     there is nothing; ``ids`` int32, ``NOTHING`` where there is nothing; ``albedo`` float32; ``cosine``
-    float32, of the angle between the ray and the surface's normal.
+    float32, of the angle between the ray and the surface's normal; ``gloss`` float32.
     """
 
     distance_m: F32
     ids: I32
     albedo: F32
     cosine: F32
+    gloss: F32
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
@@ -65,6 +72,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
         np.concatenate([mesh.faces + np.int32(k) for mesh, k in zip(meshes, first, strict=True)]),
         np.concatenate([mesh.albedo for mesh in meshes]),
         np.concatenate([mesh.ids for mesh in meshes]),
+        np.concatenate([mesh.glosses() for mesh in meshes]),
     )
 
 
@@ -78,7 +86,7 @@ def look(mesh: Mesh, intrinsics: Intrinsics, T_world_camera: F64) -> View:
     _cast_pinhole(vertices, mesh.faces, x, y, intrinsics.fx, intrinsics.fy, view.distance_m, hit)
     rays = np.empty((*hit.shape, 3))
     rays[..., 0], rays[..., 1], rays[..., 2] = x, y[:, None], 1.0
-    _shade(vertices, mesh.faces, mesh.albedo, mesh.ids, rays, hit, view.ids, view.albedo, view.cosine)
+    _shade(vertices, mesh.faces, mesh.albedo, mesh.glosses(), mesh.ids, rays, hit, view)
     return view
 
 
@@ -102,7 +110,7 @@ def spin(mesh: Mesh, elevations_rad: F64, columns: int, T_world_sensor: F64) -> 
     view = _blank(len(elevations_rad), columns)
     hit = np.full(view.ids.shape, NOTHING, np.int32)
     _cast_spinning(vertices, mesh.faces, rays, elevations_rad, view.distance_m, hit)
-    _shade(vertices, mesh.faces, mesh.albedo, mesh.ids, rays, hit, view.ids, view.albedo, view.cosine)
+    _shade(vertices, mesh.faces, mesh.albedo, mesh.glosses(), mesh.ids, rays, hit, view)
     return view, rays
 
 
@@ -111,6 +119,7 @@ def _blank(height: int, width: int) -> View:
     return View(
         np.full(shape, np.inf, np.float32),
         np.full(shape, NOTHING, np.int32),
+        np.zeros(shape, np.float32),
         np.zeros(shape, np.float32),
         np.zeros(shape, np.float32),
     )
@@ -207,17 +216,27 @@ def _cast_spinning(vertices: F64, faces: I32, rays: F64, elevations: F64, distan
                             hit[v, u] = f
 
 
-@kernel
 def _shade(
+    vertices: F64, faces: I32, albedo: F32, gloss: F32, ids: I32, rays: F64, hit: I32, view: View
+) -> None:
+    """Write to ``view`` what the faces that were hit are like."""
+    out = (view.ids, view.albedo, view.cosine, view.gloss)
+    _shade_pixels(vertices, faces, albedo, gloss, ids, rays, hit, *out)
+
+
+@kernel
+def _shade_pixels(
     vertices: F64,
     faces: I32,
     face_albedo: F32,
+    face_gloss: F32,
     face_ids: I32,
     rays: F64,
     hit: I32,
     ids: I32,
     albedo: F32,
     cosine: F32,
+    gloss: F32,
 ) -> None:
     for v in range(hit.shape[0]):
         for u in range(hit.shape[1]):
@@ -232,4 +251,5 @@ def _shade(
             length = np.sqrt((nx * nx + ny * ny + nz * nz) * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
             ids[v, u] = face_ids[f]
             albedo[v, u] = face_albedo[f]
+            gloss[v, u] = face_gloss[f]
             cosine[v, u] = abs(nx * d[0] + ny * d[1] + nz * d[2]) / length if length > 0.0 else 0.0

@@ -29,6 +29,7 @@ Rng = np.random.Generator
 
 HEAD_REACH_M = 0.155  # faces within this of the head's centre, and not below the chin, are the head's
 CHIN_M = 0.11
+GLOSS = np.array([0.05, 0.5, 0.0, 0.1, 0.8], np.float32)  # of skin, hair, cloth, hats, glasses
 LEAST_VISIBLE = 0.15
 POSTURES = ("standing", "walking", "sitting", "bending", "crouching", "lying", "arms_raised")
 POSTURE_SHARES = (0.30, 0.24, 0.26, 0.06, 0.05, 0.03, 0.06)
@@ -134,7 +135,10 @@ class Scene:
         albedo = np.array([0.6, 0.03 + 0.6 * body.hair_albedo, actor.cloth, actor.cloth, 0.06], np.float32)[
             body.materials
         ]
-        return _thing(actor.id, body.vertices, body.faces, albedo, body.T_world_head, body.posture, False)
+        gloss = GLOSS[body.materials]
+        return _thing(
+            actor.id, body.vertices, body.faces, albedo, gloss, body.T_world_head, body.posture, False
+        )
 
 
 def _dummy(dummy: Dummy, number: int) -> _Thing:
@@ -142,17 +146,25 @@ def _dummy(dummy: Dummy, number: int) -> _Thing:
     T_world_head[:3, :3] = Rotation.from_euler("z", dummy.yaw_rad).as_matrix()
     T_world_head[:3, 3] = dummy.centre
     thing = dummy.item
-    return _thing(number, thing.vertices, thing.faces, thing.albedo, T_world_head, "mannequin", True)
+    gloss = np.zeros(len(thing.faces), np.float32)
+    return _thing(number, thing.vertices, thing.faces, thing.albedo, gloss, T_world_head, "mannequin", True)
 
 
 def _thing(
-    number: int, vertices: F64, faces: Any, albedo: F32, T_world_head: F64, posture: str, ignore: bool
+    number: int,
+    vertices: F64,
+    faces: Any,
+    albedo: F32,
+    gloss: F32,
+    T_world_head: F64,
+    posture: str,
+    ignore: bool,
 ) -> _Thing:
     middle = transform(inverse(T_world_head), vertices)[faces].mean(axis=1)
     is_head = ((middle**2).sum(axis=1) < HEAD_REACH_M**2) & (middle[:, 2] > -CHIN_M)
     ids = np.where(is_head, 2 * number, 2 * number + 1).astype(np.int32)
-    mesh = Mesh(vertices, faces, albedo, ids)
-    head = Mesh(vertices, faces[is_head], albedo[is_head], ids[is_head])
+    mesh = Mesh(vertices, faces, albedo, ids, gloss)
+    head = Mesh(vertices, faces[is_head], albedo[is_head], ids[is_head], gloss[is_head])
     return _Thing(number, mesh, head, T_world_head, posture, ignore)
 
 

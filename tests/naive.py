@@ -202,7 +202,7 @@ def condition_holds(amount: np.ndarray, cell, condition: Condition, voxel: float
     return round(condition.minimum * cells, 6) <= got <= round(condition.maximum * cells, 6)
 
 
-def gate(amount: np.ndarray, cascade: Cascade, voxel: float) -> np.ndarray:
+def gate(amount: np.ndarray, cascade: Cascade, voxel: float, odd: int = 0) -> np.ndarray:
     """Return the voxels that pass every condition, in the order of x, y, z."""
     unit = 1 if cascade.counting else cascade.subdivision**3
     passed = [
@@ -210,7 +210,8 @@ def gate(amount: np.ndarray, cascade: Cascade, voxel: float) -> np.ndarray:
         for x in range(amount.shape[0])
         for y in range(amount.shape[1])
         for z in range(amount.shape[2])
-        if all(condition_holds(amount, (x, y, z), c, voxel, unit) for c in cascade.conditions)
+        if (not cascade.every_other or (x + y + z + odd) % 2 == 0)
+        and all(condition_holds(amount, (x, y, z), c, voxel, unit) for c in cascade.conditions)
     ]
     return np.array(passed, np.int32).reshape(-1, 3)
 
@@ -444,7 +445,7 @@ def detect(frame: Frame, cascade: Cascade, region: Region, min_score: float | No
     for image in frame.depths:
         grid.enter_depth(image)
     amount = grid.amounts(counting)
-    candidates = gate(amount, cascade, voxel)
+    candidates = gate(amount, cascade, voxel, sum(round(v / voxel) for v in lattice.origin))
     if cascade.votes is not None:
         scores = [score_by_votes(amount, cell, cascade.votes, voxel)[0] for cell in candidates]
     else:

@@ -7,7 +7,16 @@ import scenes
 
 from headvox.gate import pass_gate
 from headvox.integral import integral_volume, integrate
-from headvox.masks import compile_cascade, load_cascade, parse_cascade, shipped_cascades
+from headvox.masks import (
+    Box,
+    Cascade,
+    Condition,
+    Group,
+    compile_cascade,
+    load_cascade,
+    parse_cascade,
+    shipped_cascades,
+)
 
 HEAD = """
 format = "headvox-cascade"
@@ -191,3 +200,20 @@ def test_a_million_points_in_one_cell():
         '[[gate]]\nname = "r"\nboxes = [{ centre = [0, 0, 0], size = [0.15, 0.15, 0.15] }]\nmin = 37037.03\n'
     )
     assert len(same_survivors(cells, cascade_with(gate, 1, "count"))) == 27
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_every_other_voxel_equals_the_naive_twin_and_the_two_halves_are_the_whole(odd):
+    rng = np.random.default_rng(7)
+    cells = (rng.random((9, 8, 11)) < 0.15).astype(np.uint8) * rng.integers(0, 256, (9, 8, 11)).astype(
+        np.uint8
+    )
+    condition = Condition(Group("some", (Box((0, 0, 0.02), (0.06, 0.06, 0.06)),)), 0, 0.01, 1.0)
+    half = Cascade("c", "c", 0.02, 2, False, (condition,), None, (), (), 0.0, 0.0, (), every_other=True)
+    S, gate = integral_volume(cells), compile_cascade(half).gate
+    found = pass_gate(S, gate, odd)
+    np.testing.assert_array_equal(found, naive.gate(naive.weights(cells), half, 0.02, odd))
+    whole = pass_gate(S, compile_cascade(replace(half, every_other=False)).gate)
+    both = np.concatenate([found, pass_gate(S, gate, 1 - odd)])
+    assert 0 < len(found) < len(whole)
+    assert sorted(map(tuple, both.tolist())) == sorted(map(tuple, whole.tolist()))

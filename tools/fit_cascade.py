@@ -462,7 +462,7 @@ def write(path: Path, fitted: list[Fitted], least: float, least_occupied: float,
         "",
         'format = "headvox-cascade"', "version = 1", 'name = "default"',
         f'summary = "Boosted on synthetic depth: {len(GATE)} signed gate masks, then {len(fitted)} stages of trees"',
-        f"voxel_m = {VOXEL_M}", f"subdivision = {SUBDIVISION}", 'occupancy = "parts"',
+        f"voxel_m = {VOXEL_M}", f"subdivision = {SUBDIVISION}", 'occupancy = "parts"', 'candidates = "every other"',
         f"min_score = {least:.2f}", f"min_score_occupied = {least_occupied:.2f}",
         f"tuned_on = [{', '.join(repr(entry).replace(chr(39), chr(34)) for entry in tuned_on)}]", "",
     ]  # fmt: skip

@@ -42,14 +42,29 @@ def _column_sums(S, x, y, box, weight, bottom, out, adding):  # type: ignore[no-
 
 @kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S, first, last, bottom, top, boxes, weights, start, rank, limits, least, sums, alive, survivors
+    S,
+    first,
+    last,
+    bottom,
+    top,
+    boxes,
+    weights,
+    start,
+    rank,
+    limits,
+    least,
+    every_other,
+    odd,
+    sums,
+    alive,
+    survivors,
 ):
     """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many.
 
     Only voxels from ``bottom`` to ``top`` count; about them, no box may leave S in z. ``least`` is x0 x1 y0 y1 and a
-    count: a window that holds fewer in the whole column cannot pass, whatever z. ``sums`` and ``alive``, a whole number
-    of vectors long, are working memory. Counting goes on past the end of ``survivors``, so that the caller can tell
-    how many did not fit.
+    count: a window that holds fewer in the whole column cannot pass, whatever z. With ``every_other``, only voxels
+    whose x + y + z + ``odd`` is even count. ``sums`` and ``alive``, a whole number of vectors long, are working memory.
+    Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
     """
     nx, ny, n = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
     found = 0
@@ -62,7 +77,12 @@ def gate_columns(  # type: ignore[no-untyped-def]
             window = (S[wx1, wy1, n - 1] - S[wx0, wy1, n - 1]) - (S[wx1, wy0, n - 1] - S[wx0, wy0, n - 1])
             if fits and (window & 0xFFFFFFFF) < least[4]:
                 continue
-            alive[:] = 1
+            if every_other:
+                parity = x + y + bottom + odd + 1
+                for z in range(alive.shape[0]):
+                    alive[z] = (parity + z) & 1
+            else:
+                alive[:] = 1
             any_alive = True
             for i in range(rank.shape[0]):
                 begin, count = start[i], start[i + 1] - start[i]
@@ -167,6 +187,7 @@ class GateTables:
 
     tables: tuple[npt.NDArray[Any], ...]
     """Boxes, weights, starts, ranks, limits in the type of the sums, and the column bound."""
+    every_other: bool
     sums: npt.NDArray[Any]
     """Flat: :meth:`memory` cuts it to the height of the columns."""
     alive: npt.NDArray[np.uint8]
@@ -180,6 +201,7 @@ class GateTables:
         limits = np.clip(np.stack([gate.low, gate.high], axis=1), least, greatest).astype(signed)
         return cls(
             (gate.boxes, gate.weights, gate.start, gate.rank, limits, column_bound(gate)),
+            gate.every_other,
             np.empty(most * padded(height), signed),
             np.empty(padded(height), np.uint8),
         )
@@ -190,14 +212,18 @@ class GateTables:
         return self.sums[: most * length].reshape(most, length), self.alive[:length]
 
 
-def pass_gate(S: Integral, gate: CompiledGate) -> npt.NDArray[np.int32]:
-    """Return the voxels (n, 3) of the integral volume ``S`` that pass, in the order of x, y, z."""
+def pass_gate(S: Integral, gate: CompiledGate, odd: int = 0) -> npt.NDArray[np.int32]:
+    """Return the voxels (n, 3) of the integral volume ``S`` that pass, in the order of x, y, z.
+
+    ``odd`` is that of the lattice, for a gate that looks at every other voxel only.
+    """
     below, above = margins(gate)
     height = S.shape[2] - 1
     longer = np.pad(S, ((0, 0), (0, 0), (below, padded(height) - height + above)), mode="edge")
     longer[:, :, :below] = 0
     tables = GateTables.of(gate, S.dtype, height)
-    arguments = (longer, 0, S.shape[0] - 1, below, below + height, *tables.tables, *tables.memory(height))
+    arguments = (longer, 0, S.shape[0] - 1, below, below + height, *tables.tables)
+    arguments += (gate.every_other, odd + below, *tables.memory(height))
     count = gate_columns(*arguments, np.empty((0, 3), np.int32))
     survivors = np.empty((count, 3), np.int32)
     gate_columns(*arguments, survivors)

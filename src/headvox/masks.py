@@ -122,6 +122,8 @@ class Cascade:
     min_score: float
     min_score_occupied: float
     tuned_on: tuple[str, ...]
+    every_other: bool = False
+    """Whether only every other voxel is a candidate, as the black squares of a chess board are."""
 
     @property
     def sees(self) -> bool:
@@ -346,7 +348,7 @@ class _Reader:
 
     def cascade(self, value: dict[str, Any]) -> Cascade:
         known = {"format", "version", "name", "summary", "voxel_m", "subdivision", "occupancy", "gate"}
-        known |= {"votes", "group", "stage", "min_score", "min_score_occupied", "tuned_on"}
+        known |= {"votes", "group", "stage", "min_score", "min_score_occupied", "tuned_on", "candidates"}
         table = self.table(value, "the file", known)
         if table.get("format") != FORMAT or table.get("version") != 1:
             raise self.error("format, version", f'"{FORMAT}", 1', (table.get("format"), table.get("version")))
@@ -384,6 +386,9 @@ class _Reader:
                         f"stage {stages[0].name}", 'only "occupied" groups, as it is the first', feature
                     )
         min_score = self.number(table.get("min_score"), "min_score")
+        candidates = self.text(table.get("candidates", "all"), "candidates")
+        if candidates not in ("all", "every other"):
+            raise self.error("candidates", '"all" or "every other"', candidates)
         return Cascade(
             name=self.text(table.get("name"), "name"),
             summary=self.text(table.get("summary"), "summary"),
@@ -399,6 +404,7 @@ class _Reader:
             tuned_on=tuple(
                 self.text(entry, "tuned_on") for entry in self.items(table.get("tuned_on", []), "tuned_on")
             ),
+            every_other=candidates == "every other",
         )
 
 
@@ -456,6 +462,7 @@ class CompiledGate:
     rank: I32
     low: I64
     high: I64
+    every_other: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -576,6 +583,7 @@ def _compile_gate(cascade: Cascade, voxel: float, unit: int) -> CompiledGate:
         np.array(ranks, dtype=np.int32),
         np.array(lows, dtype=np.int64),
         np.array(highs, dtype=np.int64),
+        cascade.every_other,
     )
 
 

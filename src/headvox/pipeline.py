@@ -180,7 +180,9 @@ class Detector:
         def sweep(part: int) -> None:
             low, high = _share(slices, part, parts)
             gate, below = memory.gates[part], memory.below
-            arguments = (S, low, high, below, below + height, *gate.tables, *gate.memory(height))
+            odd = memory.lattice.odd + int(memory.longer[:3].sum())
+            arguments = (S, low, high, below, below + height, *gate.tables, gate.every_other, odd)
+            arguments += gate.memory(height)
             found[part] = gate_columns(*arguments, memory.survivors[part])
             if found[part] > len(memory.survivors[part]):
                 memory.survivors[part] = np.empty((2 * found[part], 3), np.int32)

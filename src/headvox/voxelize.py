@@ -70,6 +70,11 @@ class Lattice:
         """Edge of the smallest thing the grid can tell apart."""
         return self.voxel_m / self.subdivision
 
+    @property
+    def odd(self) -> int:
+        """Whether cell 0, 0, 0 is an odd number of voxels from the world's origin, along the axes: 0 or 1."""
+        return sum(round(v / self.voxel_m) for v in self.origin) & 1
+
     def limits(self) -> F32:
         """Return the region's limits in parts from the origin, as the kernels read them."""
         # In float64 up to the last step: a centre in earth coordinates, rounded to float32 first, is off by more

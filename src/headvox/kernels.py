@@ -3,6 +3,9 @@
 Every kernel is a module-level function with ``@kernel``: compiled once, cached on disk beside its source file.
 Loops release the GIL, so a frame is split over plain threads: the same compiled loop runs on a part of the rows,
 whatever the number of threads, and integer results make the split invisible in the output.
+
+Kernels and rules have no type hints, and say so to the type checker: one serves arrays of several integer types, and
+Numba infers them. The public function beside each has them.
 """
 
 from __future__ import annotations
@@ -35,7 +38,8 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     cache_file = getattr(compiled._cache, "_cache_file", None)
     if cache_file is not None:
         cache_file._source_stamp = STAMP
-    return compiled  # type: ignore[no-any-return]
+    loop: Callable[..., Any] = compiled
+    return loop
 
 
 def rule(function: Callable[..., Any]) -> Callable[..., Any]:

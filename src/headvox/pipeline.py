@@ -298,8 +298,8 @@ class Detector:
         config, centre = self.config, self.config.centre
         if centre is None:
             origins = _origins(frame)
-            centre = tuple(float(v) for v in origins.mean(axis=0)) if len(origins) else (0.0, 0.0, 0.0)  # type: ignore[assignment]
-        assert centre is not None
+            x, y, z = origins.mean(axis=0).tolist() if len(origins) else (0.0, 0.0, 0.0)
+            centre = (x, y, z)
         return Region(centre, config.max_range_m, config.min_height_m, config.max_height_m)
 
     def _rays_of(self, image: DepthImage, lattice: Lattice) -> Rays:

@@ -1,9 +1,8 @@
 """From a candidate voxel to a centre: a robust sphere through the occupied parts about it.
 
 The parts (2.5 cm at the default) about a candidate lie on the skull, the hair, the neck. A sphere of a head's size is
-fitted to them by reweighted least squares (Cauchy weights), with weak priors on radius and place. The surface that a
-sensor sees is the near side of a head that is deeper than it is wide, so the centre of the skull lies behind the centre
-of the sphere, along the ray, and a little above it.
+fitted to them by reweighted least squares (Cauchy weights), with weak priors on radius and place. Hair and hats raise
+the surface that a sensor sees, so the centre of the skull lies ``HAIR_M`` below that of the sphere.
 """
 
 from __future__ import annotations

@@ -88,12 +88,22 @@ class Heads:
     ``quaternions`` (N, 4) float64, x y z w, world from head; a row of NaN where the orientation is not known
     ``radii``       (N,)   float64, metres, of the sphere that fits the skull
     ``scores``      (N,)   float64, the cascade's score; higher is surer
+    ``centre_covariances``   (N, 3, 3) float64, m², world axes; NaN where not known
+    ``rotation_covariances`` (N, 3, 3) float64, rad², of the small turn d in R_true = R_stated exp(d), head axes; NaN
+                             where the orientation is not known
     """
 
     centres: F64 = field(default_factory=lambda: _empty(0, 3))
     quaternions: F64 = field(default_factory=lambda: _empty(0, 4))
     radii: F64 = field(default_factory=lambda: _empty(0))
     scores: F64 = field(default_factory=lambda: _empty(0))
+    centre_covariances: F64 = field(default_factory=lambda: _empty(0))
+    rotation_covariances: F64 = field(default_factory=lambda: _empty(0))
+
+    def __post_init__(self) -> None:
+        for name in ("centre_covariances", "rotation_covariances"):
+            if len(getattr(self, name)) != len(self.scores) or getattr(self, name).ndim != 3:
+                object.__setattr__(self, name, np.full((len(self.scores), 3, 3), np.nan))
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -103,6 +113,23 @@ class Heads:
             self.centres, self.quaternions, self.radii, self.scores, strict=True
         ):
             yield Head(centre, quaternion, float(radius), float(score))
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Where heads are expected in the next frame, as a tracker predicts them: structure of arrays.
+
+    ``centres``     (M, 3) float64, metres, world frame
+    ``quaternions`` (M, 4) float64, x y z w, world from head; a row of NaN where the orientation is not known
+    ``reaches_m``   (M,)   float64, metres: how far from ``centres`` the head may be
+    """
+
+    centres: F64
+    quaternions: F64
+    reaches_m: F64
+
+    def __len__(self) -> int:
+        return len(self.centres)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Stage 1: the gate. A few signed box sums, for every voxel of the volume, throw out almost all of them.
 
 It knows nothing of orientation. A voxel passes when each condition's statistic (a weighted sum over boxes, or the kth
-smallest of the sums of a group) lies within its limits. The boxes' corners are read a column of voxels at a time, so
-the compiler turns every step into vector instructions; a column is left as soon as no voxel of it is alive.
+smallest of the sums of a group) lies within its limits. Voxels are looked at 32 at a time, one above the other: the
+corners of a box about them lie next to each other. A condition ends in 32 bits; once they are 0, the rest is left out.
 """
 
 from __future__ import annotations
@@ -13,144 +13,91 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.integral import VECTOR, Integral
-from headvox.kernels import kernel, rule
+from headvox.integral import Integral, set_corners
+from headvox.kernels import bare_kernel, rule
 from headvox.masks import CompiledGate
+from headvox.simd import LANES, add, fill, less, load, lowest, sub, times, within
+
+EVEN, ALL = np.uint32(0x55555555), np.uint32(0xFFFFFFFF)
 
 
 @rule
-def _column_sums(S, x, y, box, weight, bottom, out, adding):  # type: ignore[no-untyped-def]
-    """Write to ``out``, or add to it, the weighted sums over ``box`` about the voxels of a column, from ``bottom`` up.
+def _set_corners(S, x, y, boxes, corners):  # type: ignore[no-untyped-def]
+    """Write where the corners of boxes about the column x, y lie in the flat S, from an entry of that column.
 
-    In x and y the box is cut off at the edges of S; in z it has to lie within S.
+    In x and y a box is cut off at the edges of S; in z it has to lie within S.
     """
-    nx, ny, length = S.shape[0] - 1, S.shape[1] - 1, out.shape[0]
-    x0, x1 = min(max(x + box[0], 0), nx), min(max(x + box[1], 0), nx)
-    y0, y1 = min(max(y + box[2], 0), ny), min(max(y + box[3], 0), ny)
-    a, b, c, d = S[x1, y1], S[x0, y1], S[x1, y0], S[x0, y0]
-    # Unsigned, because a signed index costs a check for counting from the end, and the loop its vectors.
-    low, high = np.uint64(bottom + box[4]), np.uint64(bottom + box[5])
-    if adding:
-        for z in range(np.uint64(length)):
-            i, j = z + high, z + low
-            out[z] += weight * (((a[i] - b[i]) - (c[i] - d[i])) - ((a[j] - b[j]) - (c[j] - d[j])))
-    else:
-        for z in range(np.uint64(length)):
-            i, j = z + high, z + low
-            out[z] = weight * (((a[i] - b[i]) - (c[i] - d[i])) - ((a[j] - b[j]) - (c[j] - d[j])))
+    nx, ny = S.shape[0] - 1, S.shape[1] - 1
+    for b in range(boxes.shape[0]):
+        x0, x1 = min(max(x + boxes[b, 0], 0), nx) - x, min(max(x + boxes[b, 1], 0), nx) - x
+        y0, y1 = min(max(y + boxes[b, 2], 0), ny) - y, min(max(y + boxes[b, 3], 0), ny) - y
+        set_corners(S, x0, x1, y0, y1, boxes[b, 4], boxes[b, 5], corners[b])
 
 
-@kernel
+@rule
+def _sums(flat, at, corners, b):  # type: ignore[no-untyped-def]
+    """Return the sums over box ``b`` about :data:`LANES` voxels, one above the other."""
+    high = sub(load(flat, at + corners[b, 0]), load(flat, at + corners[b, 1]))
+    high = sub(high, sub(load(flat, at + corners[b, 2]), load(flat, at + corners[b, 3])))
+    low = sub(load(flat, at + corners[b, 4]), load(flat, at + corners[b, 5]))
+    return sub(high, sub(low, sub(load(flat, at + corners[b, 6]), load(flat, at + corners[b, 7]))))
+
+
+@bare_kernel
+def _holds(flat, at, corners, weights, start, rank, limits, i):  # type: ignore[no-untyped-def]
+    """Return a bit for each of :data:`LANES` voxels: whether condition ``i``'s statistic lies within its limits."""
+    # Unsigned, because a signed index costs a check for counting from the end.
+    begin, end = np.uint64(start[i]), np.uint64(start[i + np.uint64(1)])
+    if rank[i] == 0:
+        total = times(_sums(flat, at, corners, begin), weights[begin])
+        for b in range(begin + np.uint64(1), end):
+            total = add(total, times(_sums(flat, at, corners, b), weights[b]))
+        return within(total, limits[i, 0], limits[i, 1])
+    # The kth smallest is no less than the lower limit where fewer than k are less than it; likewise from above.
+    low, high = fill(limits[i, 0]), fill(limits[i, 1])
+    below = above = sub(low, low)
+    for b in range(begin, end):
+        total = _sums(flat, at, corners, b)
+        below = add(below, less(total, low))
+        above = add(above, less(high, total))
+    return within(below, 0, rank[i] - 1) & within(above, 0, end - begin - np.uint64(rank[i]))
+
+
+@bare_kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S,
-    first,
-    last,
-    bottom,
-    top,
-    boxes,
-    weights,
-    start,
-    rank,
-    limits,
-    least,
-    every_other,
-    odd,
-    sums,
-    alive,
-    survivors,
-):
+    S, first, last, bottom, top, boxes, weights, start, rank, limits, reach, every_other, odd, corners, survivors,
+):  # fmt: skip
     """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many.
 
-    Only voxels from ``bottom`` to ``top`` count; about them, no box may leave S in z. ``least`` is x0 x1 y0 y1 and a
-    count: a window that holds fewer in the whole column cannot pass, whatever z. With ``every_other``, only voxels
-    whose x + y + z + ``odd`` is even count. ``sums`` and ``alive``, a whole number of vectors long, are working memory.
-    Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
+    Only voxels from ``bottom`` to ``top`` count; S has to go on for as long as the boxes about them reach, rounded up
+    to whole vectors. With ``every_other``, only voxels whose x + y + z + ``odd`` is even count. ``corners`` (boxes, 8)
+    is working memory. Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
     """
-    nx, ny, n = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
+    ny, length = S.shape[1] - 1, S.shape[2]
+    flat = S.reshape(-1)
+    near, far = -reach[2], reach[3]
     found = 0
-    # A whole column may wrap around where no box does; a voxel has 8 parts at most.
-    fits = S.itemsize > 2 or (least[1] - least[0]) * (least[3] - least[2]) * n * 8 <= 0xFFFF
     for x in range(first, last):
-        wx0, wx1 = min(max(x + least[0], 0), nx), min(max(x + least[1], 0), nx)
         for y in range(ny):
-            wy0, wy1 = min(max(y + least[2], 0), ny), min(max(y + least[3], 0), ny)
-            window = (S[wx1, wy1, n - 1] - S[wx0, wy1, n - 1]) - (S[wx1, wy0, n - 1] - S[wx0, wy0, n - 1])
-            if fits and (window & 0xFFFFFFFF) < least[4]:
-                continue
-            if every_other:
-                parity = x + y + bottom + odd + 1
-                for z in range(alive.shape[0]):
-                    alive[z] = (parity + z) & 1
-            else:
-                alive[:] = 1
-            any_alive = True
-            for i in range(rank.shape[0]):
-                begin, count = start[i], start[i + 1] - start[i]
-                if rank[i] == 0:
-                    for k in range(count):
-                        _column_sums(S, x, y, boxes[begin + k], weights[begin + k], bottom, sums[0], k > 0)
-                    any_alive = _within(sums[0], limits[i, 0], limits[i, 1], alive)
-                else:
-                    for k in range(count):
-                        _column_sums(S, x, y, boxes[begin + k], 1, bottom, sums[k], False)
-                    _sort(sums, count, rank[i])
-                    any_alive = _within(sums[rank[i] - 1], limits[i, 0], limits[i, 1], alive)
-                if not any_alive:
-                    break
-            if any_alive:
-                for z in range(top - bottom):
-                    if alive[z]:
+            if y <= near or y + far > ny:  # in between, nothing is cut off in y
+                _set_corners(S, x, y, boxes, corners)
+            column = (x * (ny + 1) + y) * length + bottom
+            for z in range(0, top - bottom, LANES):
+                alive = EVEN << np.uint32((x + y + bottom + odd) & 1) if every_other else ALL
+                for i in range(np.uint64(rank.shape[0])):
+                    alive &= _holds(flat, column + z, corners, weights, start, rank, limits, i)
+                    if alive == 0:
+                        break
+                while alive:
+                    voxel = z + lowest(alive)
+                    alive &= alive - np.uint32(1)
+                    if voxel < top - bottom:
                         if found < survivors.shape[0]:
                             survivors[found, 0] = x
                             survivors[found, 1] = y
-                            survivors[found, 2] = bottom + z
+                            survivors[found, 2] = bottom + voxel
                         found += 1
     return found
-
-
-@rule
-def _sort(rows, count, rank):  # type: ignore[no-untyped-def]
-    """Bring the ``rank``-th smallest of ``count`` rows to row rank - 1, element by element."""
-    if 2 * rank <= count:
-        for i in range(rank):
-            for j in range(i + 1, count):
-                _order(rows[i], rows[j])
-    else:
-        for i in range(count - 1, rank - 2, -1):
-            for j in range(i):
-                _order(rows[j], rows[i])
-
-
-@rule
-def _order(a, b):  # type: ignore[no-untyped-def]
-    for z in range(a.shape[0]):
-        low = min(a[z], b[z])
-        high = max(a[z], b[z])
-        a[z] = low
-        b[z] = high
-
-
-@rule
-def _within(sums, low, high, alive):  # type: ignore[no-untyped-def]
-    left = np.uint8(0)
-    for z in range(sums.shape[0]):
-        alive[z] &= np.uint8((sums[z] >= low) & (sums[z] <= high))
-        left |= alive[z]
-    return left != 0
-
-
-def column_bound(gate: CompiledGate) -> npt.NDArray[np.int64]:
-    """Return x0 x1 y0 y1 and the count that every passing voxel's column window must hold.
-
-    It follows from the condition with the highest lower limit on a single box: what is in the box is in its column.
-    """
-    best = np.zeros(5, dtype=np.int64)
-    for i, low in enumerate(gate.low):
-        first = gate.start[i]
-        if gate.start[i + 1] - first == 1 and gate.weights[first] == 1 and low > best[4]:
-            best[:4] = gate.boxes[first, :4]
-            best[4] = low
-    return best
 
 
 def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
@@ -171,14 +118,15 @@ def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
     return np.concatenate([np.minimum(reach[:3], 0), np.maximum(reach[3:], 0)])
 
 
-def margins(gate: CompiledGate) -> tuple[int, int]:
-    """Return how many voxels below and above a candidate the boxes of ``gate`` reach."""
-    return int(max(-gate.boxes[:, 4].min(initial=0), 0)), int(max(gate.boxes[:, 5].max(initial=0), 0))
+def box_reach(boxes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+    """Return the box that holds all of ``boxes`` (B, 6) and the voxel that they are about."""
+    low, high = boxes[:, 0::2].min(axis=0, initial=0), boxes[:, 1::2].max(axis=0, initial=1)
+    return np.stack([low, high], axis=1).reshape(-1).astype(np.int64)
 
 
 def padded(height: int) -> int:
     """Return the least whole number of vectors that holds ``height`` voxels."""
-    return -(-height // VECTOR) * VECTOR
+    return -(-height // LANES) * LANES
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,30 +134,21 @@ class GateTables:
     """A gate for one type of integral volume, and the working memory of one thread."""
 
     tables: tuple[npt.NDArray[Any], ...]
-    """Boxes, weights, starts, ranks, limits in the type of the sums, and the column bound."""
+    """Boxes, weights, starts, ranks, limits in the type of the sums, and how far the boxes reach."""
     every_other: bool
-    sums: npt.NDArray[Any]
-    """Flat: :meth:`memory` cuts it to the height of the columns."""
-    alive: npt.NDArray[np.uint8]
+    corners: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, gate: CompiledGate, sum_type: np.dtype[Any], height: int) -> GateTables:
-        """Return the tables for an integral volume of ``sum_type`` and candidates in columns up to ``height``."""
+    def of(cls, gate: CompiledGate, sum_type: np.dtype[Any]) -> GateTables:
+        """Return the tables for an integral volume of ``sum_type``."""
         signed = np.dtype(f"i{sum_type.itemsize}")
-        most = int(np.diff(gate.start).max(initial=1))
         least, greatest = np.iinfo(signed).min, np.iinfo(signed).max
         limits = np.clip(np.stack([gate.low, gate.high], axis=1), least, greatest).astype(signed)
         return cls(
-            (gate.boxes, gate.weights, gate.start, gate.rank, limits, column_bound(gate)),
+            (gate.boxes, gate.weights, gate.start, gate.rank, limits, box_reach(gate.boxes)),
             gate.every_other,
-            np.empty(most * padded(height), signed),
-            np.empty(padded(height), np.uint8),
+            np.empty((len(gate.boxes), 8), np.int64),
         )
-
-    def memory(self, height: int) -> tuple[npt.NDArray[Any], ...]:
-        """Return sums and alive for columns of ``height``, at most the height they were made for."""
-        most, length = len(self.sums) // len(self.alive), padded(height)
-        return self.sums[: most * length].reshape(most, length), self.alive[:length]
 
 
 def pass_gate(S: Integral, gate: CompiledGate, odd: int = 0) -> npt.NDArray[np.int32]:
@@ -217,13 +156,14 @@ def pass_gate(S: Integral, gate: CompiledGate, odd: int = 0) -> npt.NDArray[np.i
 
     ``odd`` is that of the lattice, for a gate that looks at every other voxel only.
     """
-    below, above = margins(gate)
+    reach = box_reach(gate.boxes)
+    below, above = -int(reach[4]), int(reach[5])
     height = S.shape[2] - 1
     longer = np.pad(S, ((0, 0), (0, 0), (below, padded(height) - height + above)), mode="edge")
     longer[:, :, :below] = 0
-    tables = GateTables.of(gate, S.dtype, height)
+    tables = GateTables.of(gate, S.dtype)
     arguments = (longer, 0, S.shape[0] - 1, below, below + height, *tables.tables)
-    arguments += (gate.every_other, odd + below, *tables.memory(height))
+    arguments += (gate.every_other, odd + below, tables.corners)
     count = gate_columns(*arguments, np.empty((0, 3), np.int32))
     survivors = np.empty((count, 3), np.int32)
     gate_columns(*arguments, survivors)

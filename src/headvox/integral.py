@@ -18,9 +18,6 @@ import numpy.typing as npt
 
 from headvox.kernels import kernel, rule
 
-VECTOR = 32
-"""The gate works on whole vectors of this many sums."""
-
 PARTS = np.array([value.bit_count() for value in range(256)], dtype=np.uint8)
 
 Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
@@ -80,6 +77,20 @@ def box_sum(S, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
     high = S[x1, y1, z1] - S[x0, y1, z1] - S[x1, y0, z1] + S[x0, y0, z1]
     low = S[x1, y1, z0] - S[x0, y1, z0] - S[x1, y0, z0] + S[x0, y0, z0]
     return high - low
+
+
+@rule
+def set_corners(S, x0, x1, y0, y1, z0, z1, corner):  # type: ignore[no-untyped-def]
+    """Write where the corners of a box about an entry of the flat S lie, from that entry, to ``corner`` (8,).
+
+    The box's sum is ((0 - 1) - (2 - 3)) - ((4 - 5) - (6 - 7)).
+    """
+    along_x, along_y = S.shape[1] * S.shape[2], S.shape[2]
+    x0, x1, y0, y1 = x0 * along_x, x1 * along_x, y0 * along_y, y1 * along_y
+    corner[0], corner[1] = x1 + y1 + z1, x1 + y1 + z0
+    corner[2], corner[3] = x0 + y1 + z1, x0 + y1 + z0
+    corner[4], corner[5] = x1 + y0 + z1, x1 + y0 + z0
+    corner[6], corner[7] = x0 + y0 + z1, x0 + y0 + z0
 
 
 def integral_volume(cells: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:

@@ -32,7 +32,20 @@ STAMP = _source_stamp()
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function``: cached, without the GIL, IEEE arithmetic (no contraction, no reordering)."""
-    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return _compiled(function)
+
+
+def bare_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As :func:`kernel`, for a ``function`` that allocates nothing: its arrays are not reference-counted.
+
+    A count is a call, which the compiler can neither move nor keep a vector in a register across.
+    """
+    return _compiled(function, _nrt=False)
+
+
+def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    njit: Any = numba.njit
+    compiled: Any = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     # Numba's cache looks at the date of the kernel's own file only: it would run on with an old rule when a rule of
     # another file is edited, or when a new version is installed with equal dates.
     cache_file = getattr(compiled._cache, "_cache_file", None)

@@ -16,7 +16,7 @@ from headvox.data import F64, Cloud, DepthImage, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import GateTables, candidate_reach, gate_columns, margins, padded
+from headvox.gate import GateTables, box_reach, candidate_reach, gate_columns, padded
 from headvox.integral import integrate
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
@@ -182,7 +182,7 @@ class Detector:
             gate, below = memory.gates[part], memory.below
             odd = memory.lattice.odd + int(memory.longer[:3].sum())
             arguments = (S, low, high, below, below + height, *gate.tables, gate.every_other, odd)
-            arguments += gate.memory(height)
+            arguments += (gate.corners,)
             found[part] = gate_columns(*arguments, memory.survivors[part])
             if found[part] > len(memory.survivors[part]):
                 memory.survivors[part] = np.empty((2 * found[part], 3), np.int32)
@@ -331,15 +331,16 @@ class _Memory:
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
         nx, ny, nz = lattice.shape
-        self.below, self.above = margins(cascade.gate)
+        boxes = cascade.gate.boxes
         if cascade.stages is not None:  # so that a stage, too, looks no box up beyond the ends of a column
-            self.below = max(self.below, -int(cascade.stages.boxes[:, 4].min(initial=0)))
-            self.above = max(self.above, int(cascade.stages.boxes[:, 5].max(initial=0)))
+            boxes = np.concatenate([boxes, cascade.stages.boxes])
+        below, above = box_reach(boxes)[4:].tolist()
+        self.below, self.above = -below, above
         length = self.below + padded(nz) + self.above + 1
         self.S = np.empty((nx + 1) * (ny + 1) * length, sum_type)
         self.index = np.zeros(nx * ny * length, np.int32)
         self.longer = np.zeros(6, np.int64)
-        self.gates = [GateTables.of(cascade.gate, self.S.dtype, nz) for _ in range(threads)]
+        self.gates = [GateTables.of(cascade.gate, self.S.dtype) for _ in range(threads)]
         self.reach = candidate_reach(cascade.gate)
         self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
         self.points = np.empty((MOST_PARTS, 3))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.integral import Integral, box_sum
+from headvox.integral import Integral, box_sum, set_corners
 from headvox.kernels import kernel, rule
 from headvox.masks import SCORE_UNIT, STATISTICS, CompiledStages, CompiledVotes
 
@@ -115,20 +115,6 @@ def _statistics(sums, count, ranked, out):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _corners(S, boxes, corners):  # type: ignore[no-untyped-def]
-    """Write where a box's corners lie in the flat S, from the candidate's voxel, in the order of :func:`_sum_at`."""
-    along_x, along_y = S.shape[1] * S.shape[2], S.shape[2]
-    for b in range(boxes.shape[0]):
-        x0, x1 = boxes[b, 0] * along_x, boxes[b, 1] * along_x
-        y0, y1 = boxes[b, 2] * along_y, boxes[b, 3] * along_y
-        z0, z1 = boxes[b, 4], boxes[b, 5]
-        corners[b, 0], corners[b, 1] = x1 + y1 + z1, x1 + y1 + z0
-        corners[b, 2], corners[b, 3] = x0 + y1 + z1, x0 + y1 + z0
-        corners[b, 4], corners[b, 5] = x1 + y0 + z1, x1 + y0 + z0
-        corners[b, 6], corners[b, 7] = x0 + y0 + z1, x0 + y0 + z0
-
-
-@rule
 def _sum_at(flat, at, corner, mask):  # type: ignore[no-untyped-def]
     """Return the sum over a box that lies within the volume: eight look-ups and no more."""
     a = np.int64(flat[at + corner[0]]) - np.int64(flat[at + corner[1]])
@@ -159,7 +145,10 @@ def vote_stages(  # type: ignore[no-untyped-def]
     ``corners`` (boxes, 8) and ``features`` (features,) are working memory. ``seen`` (candidates, boxes of other
     channels, 2) holds how many cells of a box are known-empty and hidden.
     """
-    _corners(S, boxes, corners)
+    for b in range(boxes.shape[0]):
+        set_corners(
+            S, boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3], boxes[b, 4], boxes[b, 5], corners[b]
+        )
     flat = S.reshape(-1)
     nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
     mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF

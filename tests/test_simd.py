@@ -1,0 +1,56 @@
+"""Vectors in kernels do what numpy does, whatever the processor makes of them."""
+
+import numpy as np
+import pytest
+
+from headvox.kernels import bare_kernel
+from headvox.simd import LANES, add, fill, less, load, lowest, store, sub, times, within
+
+
+@bare_kernel
+def arithmetic(a, b, at, factor, out):
+    """Write a + b, a - b, a * factor, a < b and a number, each in a row of ``out``."""
+    x, y = load(a, at), load(b, at)
+    flat = out.reshape(-1)
+    store(flat, 0, add(x, y))
+    store(flat, LANES, sub(x, y))
+    store(flat, 2 * LANES, times(x, factor))
+    store(flat, 3 * LANES, less(x, y))
+    store(flat, 4 * LANES, fill(a[at]))
+
+
+@bare_kernel
+def between(a, at, low, high):
+    return within(load(a, at), low, high)
+
+
+@bare_kernel
+def first_of(bits):
+    return lowest(bits)
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.uint16, np.int32, np.uint32])
+@pytest.mark.parametrize("at", [0, 1, 7])
+def test_equals_numpy(dtype, at):
+    rng = np.random.default_rng(at)
+    info = np.iinfo(dtype)
+    a, b = rng.integers(info.min, info.max, (2, 64), dtype, endpoint=True)
+    b[::3] = a[::3]
+    a[at], b[at + 1] = info.max, info.min
+    out = np.zeros((5, LANES), dtype)
+    arithmetic(a, b, at, 3, out)
+    x, y = a[at : at + LANES], b[at : at + LANES]
+    signed = np.dtype(f"i{x.itemsize}")
+    np.testing.assert_array_equal(
+        out, [x + y, x - y, x * dtype(3), x.view(signed) < y.view(signed), np.full(LANES, x[0])]
+    )
+    low, high = sorted(x.view(signed)[[3, 9]].tolist())
+    bits = between(a, at, low, high)
+    wanted = (x.view(signed) >= low) & (x.view(signed) <= high)
+    assert [bool(bits >> lane & 1) for lane in range(LANES)] == wanted.tolist()
+    assert 0 < wanted.sum() < LANES
+
+
+def test_lowest_bit():
+    for bit in range(LANES):
+        assert first_of(np.uint32((1 << bit) | (1 << 31))) == bit

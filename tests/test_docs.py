@@ -181,30 +181,3 @@ def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs" / "pictures").iterdir())
     assert {"sample.gif", "cascade-default.png", "cascade-paper.png"} <= {path.name for path in pictures}
     assert all(path.stat().st_size < 2_000_000 for path in pictures)
-
-
-def test_heads_are_scored_as_the_accuracy_page_says(tmp_path: Path) -> None:
-    def line(stamp: int, heads: list[dict[str, object]], **more: object) -> str:
-        return json.dumps({"stamp_ns": stamp, "heads": heads, **more}) + "\n"
-
-    def at(*centre: float, **more: object) -> dict[str, object]:
-        return {"centre": centre, **more}
-
-    found, truth = tmp_path / "found.jsonl", tmp_path / "heads.jsonl"
-    found.write_text(
-        line(0, [at(0, 0, 0.1), at(0, 0, 0.02), at(5, 0, 0), at(9, 0, 0)])
-        + line(1, [at(0, 0, 0)])
-        + line(2, [at(1, 1, 1)])
-    )
-    truth.write_text(
-        line(0, [at(0, 0, 0), at(1, 0, 0), at(5, 0, 0.1, ignore=True)], exhaustive=True)
-        + line(1, [], exhaustive=False)
-        + line(2, [], exhaustive=True)
-        + line(3, [at(0, 0, 0)], exhaustive=True)
-    )
-    script = ROOT / "bench" / "score.py"
-    done = subprocess.run([sys.executable, script, found, truth], capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout) == {
-        "frames": 3, "heads": 3, "found": 1, "recall": 0.3333, "false": 3, "false_a_frame": 1.0,
-        "mean_error_m": 0.02, "median_error_m": 0.02,
-    }  # fmt: skip

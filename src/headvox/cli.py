@@ -1,7 +1,7 @@
 """The command ``headvox``: flags in, calls to the library, exit codes out.
 
-0 good, 1 a known error, 2 wrong usage, 130 Ctrl-C. Heavy imports are inside the commands, so that ``--help``
-is immediate. Results go to standard output and nothing else does.
+0 good, 1 a known error, 2 wrong usage, 3 a limit of eval missed, 130 Ctrl-C. Heavy imports are inside the commands,
+so that ``--help`` is immediate. Results go to standard output and nothing else does.
 """
 
 from __future__ import annotations
@@ -25,11 +25,15 @@ from headvox.table import printable, table
 if TYPE_CHECKING:
     from headvox.config import DetectorConfig
 
-GOOD, KNOWN_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
+GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED = 0, 1, 2, 3, 130
 
 # Commands that read their own flags: `headvox NAME ...` is main([...]) of a module, which returns the code.
 MODULES = {
     "synth": ("headvox.synth.command", "make heads, people and recordings with known truth"),
+    "eval": (
+        "headvox.evaluate.command",
+        "measure how good it is, on the paper's scenarios and on recordings",
+    ),
     "bench": ("headvox.bench", "measure how fast it is here"),
 }
 
@@ -44,8 +48,9 @@ examples:
   headvox run recording/ -o heads.csv          one row a head
   headvox config --max-range 4 > my.toml       settings to keep, for --config my.toml
   headvox synth two-cameras -o rig             a recording of synthetic people, with their true heads
+  headvox eval rig                             how many of them are found, and how well
 
-exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 130 Ctrl-C
+exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 3 an eval limit missed, 130 Ctrl-C
 """
 
 
@@ -79,13 +84,13 @@ def _dispatch(arguments: list[str]) -> int:
         return int(done.code or GOOD)
     try:
         return int(args.command(args))
-    except _UsageError as error:
+    except UsageError as error:
         args.parser.print_usage(sys.stderr)
         _complain(f"error: {error}", f"See {args.parser.prog} --help.")
         return USAGE
 
 
-class _UsageError(Exception):
+class UsageError(Exception):
     """The flags do not go together."""
 
 
@@ -127,11 +132,11 @@ def _forget_stdout() -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    config = _config(args)
+    config = config_of(args)
     from headvox.sinks import Sink, open_sink
     from headvox.sources import open_source
 
-    path = args.source or _sample()
+    path = args.source or sample_folder()
     with ExitStack() as stack:
         source = stack.enter_context(closing(open_source(path)))
 
@@ -183,7 +188,7 @@ def _show_config(args: argparse.Namespace) -> int:
     from headvox.config import to_toml
     from headvox.masks import load_cascade
 
-    config = _config(args)
+    config = config_of(args)
     load_cascade(config.cascade)  # a wrong name is to be told now, not when the file is used
     print(to_toml(config), end="")
     return GOOD
@@ -241,14 +246,15 @@ def _masks_plot(args: argparse.Namespace) -> int:
     return GOOD
 
 
-def _sample() -> Path:
+def sample_folder() -> Path:
+    """Return the recording that ships with headvox."""
     sample = Path(__file__).parent / "assets" / "sample"
     if not sample.is_dir():
         raise HeadvoxError("This headvox has no sample recording in it.", "Give a SOURCE: headvox run PATH.")
     return sample
 
 
-def _config(args: argparse.Namespace) -> DetectorConfig:
+def config_of(args: argparse.Namespace) -> DetectorConfig:
     """Return the settings: flags beat the file, the file beats the defaults."""
     from dataclasses import fields, replace
 
@@ -262,7 +268,7 @@ def _config(args: argparse.Namespace) -> DetectorConfig:
     try:
         return replace(config, **flags)
     except HeadvoxError as error:
-        raise _UsageError(error.what) from None
+        raise UsageError(error.what) from None
 
 
 def _keep_input(output: Path, inputs: Sequence[str | Path | None]) -> None:
@@ -317,14 +323,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
     run.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
-    _add_settings(run)
+    add_settings(run)
     run.usage = "%(prog)s [SOURCE] [--json] [-o OUT] [flags]"
 
     info = _command(commands, "info", _info, "tell what a source holds")
     info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
 
     config = _command(commands, "config", _show_config, "print the settings as TOML, as --config takes them")
-    _add_settings(config)
+    add_settings(config)
     config.usage = "%(prog)s [flags]"
 
     _command(commands, "warmup", _warmup, "compile every loop now, so that no first run has to wait")
@@ -361,7 +367,7 @@ def _command(
     return parser
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
+def add_settings(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each setting; without the flag, the file or the default says."""
     group = parser.add_argument_group(
         "settings of the detector", "flags beat --config, --config beats the defaults"

@@ -1,0 +1,313 @@
+"""The command ``headvox eval``: run, score, print, save, compare."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from headvox import __version__
+from headvox.cli import (
+    GOOD,
+    LIMIT_MISSED,
+    UsageError,
+    add_settings,
+    config_of,
+    number,
+    sample_folder,
+    whole_number,
+)
+from headvox.live import Live
+from headvox.table import printable
+
+if TYPE_CHECKING:
+    from headvox.config import DetectorConfig
+    from headvox.evaluate.loop import Run
+    from headvox.evaluate.match import Rules
+    from headvox.evaluate.report import Limit, Report
+    from headvox.evaluate.scenarios import Scenario
+    from headvox.evaluate.scores import Scores
+
+ALL = ("static", "rotation", "two-cameras", "sample")
+EXAMPLES = """\
+what to evaluate:
+  static        the shells of 44 heads, each under 100 random rotations
+  rotation      a shell that turns by 12 degrees a second: every cloud, and every fifth
+  two-cameras   people who walk between two simulated D435i, 4 m apart
+  sample        the recording that ships with headvox
+  all           these four
+  PATH          a recording, or a folder of clouds, with heads.jsonl in it
+
+examples:
+  headvox eval recording                            how many heads are found, and how well
+  headvox eval all recording -o report              everything, with plots and pictures
+  headvox eval recording --limit recall=0.95 false_per_frame=0.05
+  headvox eval recording --heads other.jsonl        another detector's results
+  headvox eval compare old/report.json new/report.json
+
+exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 3 a limit missed, 130 Ctrl-C
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``headvox eval`` with these arguments and return the exit code."""
+    if argv and argv[0] == "compare":
+        return _compare(argv[1:])
+    parser = _parser()
+    args = parser.parse_args(argv)
+    try:
+        return _evaluate(args)
+    except UsageError as error:
+        parser.error(str(error))
+
+
+def _compare(argv: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(
+        "headvox eval compare", description="Show what differs between two reports.", allow_abbrev=False
+    )
+    for name in ("old", "new"):
+        parser.add_argument(
+            name, type=Path, metavar=f"{name.upper()}.json", help="report.json of `headvox eval -o`"
+        )
+    args = parser.parse_args(argv)
+    from headvox.evaluate.report import Report, compare
+
+    print(compare(Report.load(args.old), Report.load(args.new)))
+    return GOOD
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from headvox.evaluate.match import Rules
+    from headvox.evaluate.report import Report
+
+    rules = Rules(args.radius, args.clear, args.count_truncated)
+    configs = [config_of(args)]
+    configs += [replace(configs[0], cascade=name) for name in args.against]
+    scenarios = _scenarios(args)
+    live = Live(sys.stderr, None)
+    scores: list[Scores] = []
+    runs: list[tuple[Scores, Run]] = []
+    try:
+        for scenario in scenarios:
+            for done in _run(scenario, configs, args, rules, live):
+                scores += done[0]
+                runs.append((done[0][0], done[1]))
+    finally:
+        live.close()
+    report = Report(tuple(scores), _made(configs, rules, args))
+    if args.output is not None:
+        _write(report, runs, args.output)
+    print(json.dumps(_plain(report), indent=1, allow_nan=False) if args.json else _text(report, args.details))
+    missed = [line for limit in args.limit for line in limit.missed(report)]
+    for line in missed:
+        print(printable(f"headvox: limit missed: {line}"), file=sys.stderr)
+    return LIMIT_MISSED if missed else GOOD
+
+
+def _scenarios(args: argparse.Namespace) -> list[Scenario]:
+    """Return what was asked for, in the order given."""
+    from headvox.evaluate import scenarios as known
+
+    asked = [name for what in args.what for name in (ALL if what == "all" else (what,))]
+    made: list[Scenario] = []
+    for what in dict.fromkeys(asked):
+        if what == "static":
+            made.append(known.static(args.identities, args.turns, args.seed))
+        elif what == "rotation":
+            made += [
+                known.rotation(1, args.revolutions, args.seed),
+                known.rotation(5, args.revolutions, args.seed),
+            ]
+        elif what == "two-cameras":
+            made.append(
+                known.two_cameras(args.walkers, args.frames, args.people, 100 + args.seed, args.workers)
+            )
+        elif what == "sample":
+            made.append(known.recording(sample_folder(), "sample", synthetic=True))
+        else:
+            made.append(known.recording(Path(what)))
+    if args.heads is not None and (len(made) != 1 or made[0].recording == ""):
+        raise UsageError("--heads goes with exactly one recording")
+    return made
+
+
+def _run(
+    scenario: Scenario, configs: Sequence[DetectorConfig], args: argparse.Namespace, rules: Rules, live: Live
+) -> list[tuple[list[Scores], Run]]:
+    """Return the scores of each detector on a scenario, and what it found."""
+    from headvox.evaluate.found import read_found
+    from headvox.evaluate.loop import run_detector, run_lines
+    from headvox.evaluate.scores import score
+    from headvox.masks import load_cascade
+
+    if args.heads is not None:
+        run = run_lines(scenario, read_found(args.heads), rules)
+        name = args.name or args.heads.stem
+        return [([score(scenario.name, name, run.samples, rules)], run)]
+    done = []
+    for config in configs:
+
+        def show(k: int, config: DetectorConfig = config) -> None:
+            live.show(f"{scenario.name}, {config.cascade}: frame {k} of {scenario.length}")
+
+        run = run_detector(scenario, config, rules, show)
+        if run.bad:
+            live.note(
+                f"headvox: {scenario.name}: {run.bad} frames could not be used; their heads count as missed"
+            )
+        done.append(
+            (_scores(scenario, config.cascade, load_cascade(config.cascade).tuned_on, run, rules), run)
+        )
+    return done
+
+
+def _scores(
+    scenario: Scenario, cascade: str, tuned_on: Sequence[str], run: Run, rules: Rules
+) -> list[Scores]:
+    """Return the scores on all frames, and those on the frames kept aside where some were not."""
+    import numpy as np
+
+    from headvox.evaluate.heldout import tuned_frames, word
+    from headvox.evaluate.scores import score
+
+    labelled = [sample for sample in run.samples if sample.true is not None]
+    used = (
+        tuned_frames(tuned_on, scenario.recording, len(labelled)) if scenario.recording else np.zeros(0, bool)
+    )
+    scores = [score(scenario.name, cascade, run.samples, rules, word(used, tuned_on, scenario.synthetic))]
+    if used.any() and not used.all():
+        aside = [sample for sample, was_used in zip(labelled, used, strict=True) if not was_used]
+        scores.append(score(f"{scenario.name}, kept aside", cascade, aside, rules, "no"))
+    return scores
+
+
+def _made(configs: Sequence[DetectorConfig], rules: Rules, args: argparse.Namespace) -> dict[str, Any]:
+    """Return how the report was made."""
+    import numba
+    import numpy
+
+    from headvox.masks import load_cascade
+
+    return {
+        "headvox": __version__,
+        "python": platform.python_version(),
+        "numpy": numpy.__version__,
+        "numba": numba.__version__,
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+        "rules": asdict(rules),
+        "settings": [] if args.heads else [asdict(config) for config in configs],
+        "tuned_on": {}
+        if args.heads
+        else {c.cascade: list(load_cascade(c.cascade).tuned_on) for c in configs},
+    }
+
+
+def _plain(report: Report) -> dict[str, Any]:
+    return {"made": report.made, "scores": [asdict(scores) for scores in report.scores]}
+
+
+def _text(report: Report, details: bool) -> str:
+    parts = [report.table()]
+    if details:
+        parts.append(report.details())
+    for cascade, tuned_on in report.made["tuned_on"].items():
+        words = tuned_on or ["not told"]
+        parts.append("\n".join([f"{cascade} was tuned on", *(f"  {entry}" for entry in words)]))
+    return "\n\n".join(part for part in parts if part)
+
+
+def _write(report: Report, runs: Sequence[tuple[Scores, Run]], folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    report.save(folder / "report.json")
+
+
+# -------------------------------------------------------------------------------------------------- flags
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "headvox eval",
+        description="Measure how good the detector is, where the true heads are known.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.usage = "%(prog)s WHAT [WHAT ...] [flags]\n       %(prog)s compare OLD.json NEW.json"
+    parser.add_argument("what", nargs="+", metavar="WHAT", help="see below")
+    parser.add_argument(
+        "--against", action="append", default=[], metavar="CASCADE", help="evaluate this one, too"
+    )
+    parser.add_argument(
+        "-o", dest="output", type=Path, metavar="DIR", help="write report.json, plots and pictures"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the whole report as JSON, and nothing else"
+    )
+    parser.add_argument(
+        "--details", action="store_true", help="also by distance, visible share, views, posture"
+    )
+    parser.add_argument(
+        "--limit", type=limit, nargs="+", action="extend", default=[], metavar="[WHAT:]FIGURE=NUMBER",
+        help="exit with 3 when a figure of report.json is worse",
+    )  # fmt: skip
+    peers = parser.add_argument_group("another detector")
+    peers.add_argument(
+        "--heads", type=Path, metavar="FILE", help="its results, lines as `headvox run --json` has them"
+    )
+    peers.add_argument("--name", metavar="NAME", help="what to call it (the name of the file)")
+    rules = parser.add_argument_group("what counts")
+    rules.add_argument(
+        "--radius", type=length, default=0.15, metavar="M", help="found within this distance (0.15)"
+    )
+    rules.add_argument(
+        "--clear", type=length, default=0.0, metavar="M",
+        help="a detection that is left over is no false head this near to a true one (0)",
+    )  # fmt: skip
+    rules.add_argument(
+        "--count-truncated", action="store_true", help="heads cut by the image's border count, too"
+    )
+    scenes = parser.add_argument_group("size of the scenarios")
+    for name, usual, text in (
+        ("identities", 44, "static: how many heads"),
+        ("turns", 100, "static: rotations of each"),
+        ("walkers", 4, "two-cameras: scenes, each with people of its own"),
+        ("frames", 60, "two-cameras: frames of each scene, 10 a second"),
+        ("people", 1, "two-cameras: people at a time"),
+        ("workers", os.cpu_count() or 1, "two-cameras: processes that make the images"),
+    ):
+        scenes.add_argument(
+            f"--{name}", type=whole_number, default=usual, metavar="N", help=f"{text} ({usual})"
+        )
+    scenes.add_argument(
+        "--revolutions", type=length, default=1.0, metavar="R", help="rotation: how many turns (1)"
+    )
+    scenes.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="another number, other heads and people (0)"
+    )
+    add_settings(parser)
+    return parser
+
+
+def limit(text: str) -> Limit:
+    """Read a limit, for argparse."""
+    from headvox.evaluate.report import Limit
+
+    try:
+        return Limit.parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def length(text: str) -> float:
+    """Read a number that is not below 0, for argparse."""
+    value = number(text)
+    if value < 0.0:
+        raise argparse.ArgumentTypeError(f"expected 0 or more, got {text!r}")
+    return value

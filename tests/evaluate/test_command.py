@@ -1,0 +1,195 @@
+"""``headvox eval`` as a user gives it: what it prints, writes and returns."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import headvox
+from headvox.cli import main
+from headvox.evaluate.heldout import tuned_frames, word
+
+SAMPLE = Path(headvox.__file__).parent / "assets" / "sample"
+CENTRES = {0: [[0.0, 0.0, 1.6], [1.0, 0.0, 1.6]], 1: [], 2: [[0.0, 0.0, 1.6]]}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first six frames of the sample."""
+    folder = tmp_path_factory.mktemp("eval") / "six"
+    shutil.copytree(SAMPLE, folder)
+    description = json.loads((folder / "recording.json").read_text("utf-8"))
+    description["frames"] = description["frames"][:6]
+    (folder / "recording.json").write_text(json.dumps(description))
+    return folder
+
+
+def lines(path: Path, heads: dict[int, list[list[float]]], **more: object) -> Path:
+    rows = [
+        {"stamp_ns": s, "heads": [{"centre": c, **more} for c in centres]} for s, centres in heads.items()
+    ]
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return path
+
+
+@pytest.fixture
+def clouds(tmp_path: Path) -> Path:
+    """Three clouds, 1/30 s apart, and where heads are in them."""
+    folder = tmp_path / "three"
+    folder.mkdir()
+    for k in range(3):
+        np.save(folder / f"{k}.npy", np.zeros((9, 3), np.float32))
+    lines(folder / "heads.jsonl", {k * 33_333_333: centres for k, centres in CENTRES.items()})
+    return folder
+
+
+def test_a_recording_is_scored(recording: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "report"
+    assert main(["eval", str(recording), "--details", "-o", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[0].split()[:3] == ["scenario", "detector", "tuned"]
+    assert shown.splitlines()[1].split()[:3] == ["six", "default", "no"]
+    assert "distance [m]" in shown
+    assert "both thresholds: recording filinha" in shown
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    (scores,) = report["scores"]
+    assert (scores["frames"], scores["heads"], scores["truncated"]) == (6, 17, 1)
+    assert scores["recall"] == scores["found"] / 17 > 0.8
+    assert scores["latency_p50_ms"] > 0
+    assert scores["centre_mean_m"] < 0.05
+    assert scores["curve"][-1][1] >= scores["recall"]
+    assert sum(group["heads"] for group in scores["groups"]["posture"]) == 17
+
+
+def test_what_headvox_run_wrote_scores_as_the_detector_does(
+    recording: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    found = tmp_path / "mine.jsonl"
+    assert main(["run", str(recording), "--no-track", "-o", str(found)]) == 0
+    capsys.readouterr()
+    reports = []
+    for more in ([], ["--heads", str(found)]):
+        assert main(["eval", str(recording), "--json", *more]) == 0
+        reports.append(json.loads(capsys.readouterr().out))
+    ours, theirs = (report["scores"][0] for report in reports)
+    assert theirs["detector"] == "mine"
+    for figure in ("frames", "heads", "found", "false", "recall", "precision"):
+        assert ours[figure] == theirs[figure]
+    assert theirs["centre_mean_m"] == pytest.approx(ours["centre_mean_m"], abs=1e-4)
+
+
+def test_another_detector_by_hand(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Frame 0: one of two heads, 3 cm off, and one at 4 m; frame 1: nobody, one found; frame 2 has no line: missed.
+    found = lines(tmp_path / "other.jsonl", {0: [[0.03, 0, 1.6], [4, 0, 1]], 33_333_333: [[2, 0, 1]]}, id="a")
+    assert main(["eval", str(clouds), "--heads", str(found), "--name", "Other", "--json"]) == 0
+    (scores,) = json.loads(capsys.readouterr().out)["scores"]
+    assert scores["detector"] == "Other"
+    assert (scores["frames"], scores["heads"], scores["found"], scores["false"]) == (3, 3, 1, 2)
+    assert scores["centre_mean_m"] == pytest.approx(0.03)
+    assert scores["latency_p50_ms"] is None
+
+
+def test_limits_set_the_exit_code(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = lines(tmp_path / "other.jsonl", {0: CENTRES[0], 33_333_333: [[2, 0, 1]]})
+    command = ["eval", str(clouds), "--heads", str(found), "--limit"]
+    # Recall 2/3, one false head in three frames.
+    assert main([*command, "recall=0.6", "false_per_frame=0.34", "three:found=2"]) == 0
+    assert main([*command, "recall=0.67", "false_per_frame=0.33"]) == 3
+    told = capsys.readouterr().err
+    assert "three, other: recall is 0.6667, the limit is at least 0.67" in told
+    assert "false_per_frame is 0.3333, the limit is at most 0.33" in told
+    assert main([*command, "hota=0.5"]) == 3
+    assert "hota was not measured" in capsys.readouterr().err
+    assert main([*command, "four:recall=0.1"]) == 3
+    for wrong in ("recall", "recall=x", "recall=nan", "heads=3", "centre_bias_m=1"):
+        assert main([*command, wrong]) == 2
+        assert "expected" in capsys.readouterr().err
+
+
+def test_two_reports_are_compared(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, heads in (("old", {0: CENTRES[0], 33_333_333: [[2, 0, 1]]}), ("new", {0: [CENTRES[0][0]]})):
+        found = lines(tmp_path / f"{name}.jsonl", heads)
+        assert main(["eval", str(clouds), "--heads", str(found), "-o", str(tmp_path / name)]) == 0
+    capsys.readouterr()
+    reports = [str(tmp_path / name / "report.json") for name in ("old", "new")]
+    assert main(["eval", "compare", *reports]) == 0
+    rows = {row.split()[1]: row.split() for row in capsys.readouterr().out.splitlines()[1:]}
+    assert rows["recall"] == ["three", "recall", "0.6667", "0.3333", "-0.3333", "worse"]
+    assert rows["false_per_frame"][-1] == "better"
+    assert main(["eval", "compare", reports[0], reports[0]]) == 0
+    assert "No figure differs" in capsys.readouterr().out
+    assert main(["eval", "compare", reports[0], str(clouds / "heads.jsonl")]) == 1
+    assert "expected a report" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[", "line 1: no JSON"),
+        ("[]", "expected an object"),
+        ('{"stamp_ns": 0}', "expected a list of objects under 'heads'"),
+        ('{"stamp_ns": 0.5, "heads": []}', "whole number under 'stamp_ns'"),
+        ('{"stamp_ns": 0, "heads": [{"centre": [0, 0]}]}', "centre: expected 3 finite numbers"),
+        ('{"stamp_ns": 0, "heads": [{"centre": [0, 0, NaN]}]}', "centre: expected 3 finite numbers"),
+        ('{"stamp_ns": 0, "heads": [{"centre": [0, 0, 0], "quaternion": [0, 0, 0, 9]}]}', "norm 9"),
+        ('{"stamp_ns": 0, "heads": []}\n{"stamp_ns": 0, "heads": []}', "line 2: a second line"),
+        ('{"stamp_ns": 5, "heads": []}', "no line has the stamp"),
+        ("\xff", "UTF-8"),
+    ],
+)
+def test_bad_lines_are_told(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, told: str
+) -> None:
+    found = tmp_path / "bad.jsonl"
+    found.write_bytes(text.encode("latin-1"))
+    assert main(["eval", str(clouds), "--heads", str(found)]) == 1
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('{"stamp_ns": 0, "heads": [{"centre": [0, 0, 0], "id": "a"}]}', "whole number or null under 'id'"),
+        ('{"stamp_ns": 0, "heads": [{"centre": [0, 0, 0], "ignore": 1}]}', "true or false under 'ignore'"),
+        ('{"stamp_ns": 0, "heads": [{"centre": [0, 0, 0], "visible": [1]}]}', "camera: share"),
+        ('{"stamp_ns": 0, "heads": [{"centre": [0, 0, 0], "posture": 3}]}', "a word under 'posture'"),
+        ('{"stamp_ns": 0, "heads": [], "exhaustive": false}', "no frame has labels"),
+        ('{"stamp_ns": 7, "heads": []}', "no frame has labels"),
+    ],
+)
+def test_bad_truth_is_told(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, told: str
+) -> None:
+    found = lines(tmp_path / "other.jsonl", {0: []})
+    (clouds / "heads.jsonl").write_text(line)
+    assert main(["eval", str(clouds), "--heads", str(found)]) == 1
+    assert told in capsys.readouterr().err
+
+
+def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval"]) == 2
+    assert main(["eval", "static", "--heads", "x.jsonl"]) == 2
+    assert main(["eval", str(clouds), "--radius", "-1"]) == 2
+    assert main(["eval", str(clouds), "--max-range", "-1"]) == 2
+    (clouds / "heads.jsonl").unlink()
+    assert main(["eval", str(clouds)]) == 1
+    assert "there is no heads.jsonl beside it" in capsys.readouterr().err
+    assert main(["eval", str(tmp_path / "nothing")]) == 1
+
+
+def test_which_frames_a_cascade_was_tuned_on() -> None:
+    told = ["boosting: synthetic views", "thresholds: recording filinha, every other labelled frame from the first",
+            "thresholds: recording five_people"]  # fmt: skip
+    assert tuned_frames(told, "filinha", 5).tolist() == [True, False, True, False, True]
+    assert tuned_frames(told, "five_people", 2).tolist() == [True, True]
+    for other in ("five", "people", "fil", "five_people-2", "chocapics"):
+        assert not tuned_frames(told, other, 3).any()
+    assert word(tuned_frames(told, "filinha", 5), told, False) == "partly"
+    assert word(tuned_frames(told, "five_people", 1), told, False) == "yes"
+    assert word(tuned_frames(told, "x", 1), told, False) == "no"
+    assert word(tuned_frames(told, "x", 1), told, True) == "alike"
+    assert word(tuned_frames([], "x", 1), [], True) == "not told"

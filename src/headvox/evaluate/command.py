@@ -42,6 +42,7 @@ what to evaluate:
   two-cameras   people who walk between two simulated D435i, 4 m apart
   sample        the recording that ships with headvox
   all           these four
+  peers         32 views of four bodies, see docs/evaluation.md
   PATH          a recording, or a folder of clouds, with heads.jsonl in it
 
 examples:
@@ -89,13 +90,12 @@ def _evaluate(args: argparse.Namespace) -> int:
     rules = Rules(args.radius, args.clear, args.count_truncated)
     configs = [config_of(args)]
     configs += [replace(configs[0], cascade=name) for name in args.against]
-    scenarios = _scenarios(args)
     live = Live(sys.stderr, None)
     scores: list[Scores] = []
     runs: list[tuple[Scores, Run]] = []
     try:
-        for scenario in scenarios:
-            for done in _run(scenario, configs, args, rules, live):
+        for scenario in _scenarios(args, live):
+            for done in _run(scenario, configs, args, scenario.rules or rules, live):
                 scores += done[0]
                 runs.append((done[0][0], done[1]))
     finally:
@@ -110,9 +110,11 @@ def _evaluate(args: argparse.Namespace) -> int:
     return LIMIT_MISSED if missed else GOOD
 
 
-def _scenarios(args: argparse.Namespace) -> list[Scenario]:
+def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
     """Return what was asked for, in the order given."""
     from headvox.evaluate import scenarios as known
+    from headvox.evaluate.around import around
+    from headvox.evaluate.keep import keep
 
     asked = [name for what in args.what for name in (ALL if what == "all" else (what,))]
     made: list[Scenario] = []
@@ -129,11 +131,21 @@ def _scenarios(args: argparse.Namespace) -> list[Scenario]:
                 known.two_cameras(args.walkers, args.frames, args.people, 100 + args.seed, args.workers)
             )
         elif what == "sample":
-            made.append(known.recording(sample_folder(), "sample", synthetic=True))
+            made.append(replace(known.recording(sample_folder()), synthetic=True))
+        elif what == "peers":
+            if args.clouds is None:
+                raise UsageError("peers needs --clouds FOLDER, with the four meshes of the paper's authors")
+            made.append(around(args.clouds))
         else:
             made.append(known.recording(Path(what)))
-    if args.heads is not None and (len(made) != 1 or made[0].recording == ""):
-        raise UsageError("--heads goes with exactly one recording")
+    if args.keep is not None:
+        if len(made) != 1 or made[0].name not in ("two-cameras", "peers"):
+            raise UsageError("--keep goes with exactly one of two-cameras and peers")
+        made = [
+            keep(made[0], args.keep, lambda k: live.show(f"{made[0].name}: frame {k} of {made[0].length}"))
+        ]
+    if args.heads is not None and (len(made) != 1 or not (made[0].recording or made[0].rules)):
+        raise UsageError("--heads goes with exactly one recording, or with peers")
     return made
 
 
@@ -257,11 +269,18 @@ def _parser() -> argparse.ArgumentParser:
         "--limit", type=limit, nargs="+", action="extend", default=[], metavar="[WHAT:]FIGURE=NUMBER",
         help="exit with 3 when a figure of report.json is worse",
     )  # fmt: skip
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        metavar="DIR",
+        help="write the frames of two-cameras or peers, as a depth recording",
+    )
     peers = parser.add_argument_group("another detector")
     peers.add_argument(
         "--heads", type=Path, metavar="FILE", help="its results, lines as `headvox run --json` has them"
     )
     peers.add_argument("--name", metavar="NAME", help="what to call it (the name of the file)")
+    peers.add_argument("--clouds", type=Path, metavar="DIR", help="peers: folder of the four meshes")
     rules = parser.add_argument_group("what counts")
     rules.add_argument(
         "--radius", type=length, default=0.15, metavar="M", help="found within this distance (0.15)"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from headvox.data import F64, BadFrame, Cloud, Frame
 from headvox.errors import HeadvoxError
+from headvox.evaluate.match import Rules
 from headvox.evaluate.truth import FILE, TrueHeads, read_truth
 
 if TYPE_CHECKING:
@@ -36,14 +37,19 @@ class Scenario:
     length: int
     frames: Callable[[], Iterator[Labelled]]
     synthetic: bool
+    """Made by :mod:`headvox.synth`, as the training scenes of a cascade may be."""
     recording: str = ""
     """The name that a cascade's ``tuned_on`` knows these frames by."""
+    moving: bool = True
+    """Whether a frame follows on the one before."""
+    rules: Rules | None = None
+    """What counts here, where that is part of the scenario."""
 
 
 def static(identities: int = 44, turns: int = 100, seed: int = 0) -> Scenario:
     """The paper's scenario I: the shell of each identity, 9,000 points, under random rotations about its centre."""
     return Scenario(
-        "static", identities * turns, partial(_static, identities, turns, seed), synthetic=True, recording=""
+        "static", identities * turns, partial(_static, identities, turns, seed), synthetic=True, moving=False
     )
 
 
@@ -52,7 +58,7 @@ def _static(identities: int, turns: int, seed: int) -> Iterator[Labelled]:
         shell = shell_in_head_frame(identities, number, seed)
         rotations = Rotation.random(turns, random_state=np.random.default_rng([seed, number, 0x57A7]))
         for k, turn in enumerate(rotations):
-            yield _turned(shell, turn, number * turns + k, number)
+            yield _turned(shell, turn, number * turns + k, None)
 
 
 def rotation(every: int = 1, revolutions: float = 1.0, seed: int = 0) -> Scenario:
@@ -72,6 +78,7 @@ def _rotation(every: int, count: int, seed: int) -> Iterator[Labelled]:
         yield _turned(shell, Rotation.from_euler("z", yaw), round(k * every * 1e9 / CLOUD_RATE_HZ), 0)
 
 
+@lru_cache(maxsize=64)
 def shell_in_head_frame(identities: int, number: int, seed: int) -> F64:
     """Return the 9,000 points of a head of the paper's data set, as ``headvox synth heads`` makes it."""
     from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
@@ -82,7 +89,7 @@ def shell_in_head_frame(identities: int, number: int, seed: int) -> F64:
     return np.asarray(points @ HEADVOX_TO_PAPER)
 
 
-def _turned(shell: F64, turn: Rotation, stamp_ns: int, person: int) -> Labelled:
+def _turned(shell: F64, turn: Rotation, stamp_ns: int, person: int | None) -> Labelled:
     points = np.ascontiguousarray(turn.apply(shell), dtype=np.float32)
     head = {"id": person, "centre": [0.0, 0.0, 0.0], "quaternion": turn.as_quat().tolist()}
     return Frame(stamp_ns, clouds=(Cloud("shell", points),)), TrueHeads.of(stamp_ns, [head])
@@ -132,7 +139,7 @@ def _row(head: TrueHead, ids_from: int) -> dict[str, object]:
     }
 
 
-def recording(path: Path, name: str | None = None, synthetic: bool = False) -> Scenario:
+def recording(path: Path) -> Scenario:
     """Whatever :func:`headvox.open_source` reads, with ``heads.jsonl`` in its folder.
 
     Raises:
@@ -158,4 +165,4 @@ def recording(path: Path, name: str | None = None, synthetic: bool = False) -> S
             reading.close()
 
     source.close()
-    return Scenario(name or source.name, source.length or 0, frames, synthetic, name or source.name)
+    return Scenario(source.name, source.length or 0, frames, synthetic=False, recording=source.name)

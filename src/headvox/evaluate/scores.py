@@ -50,6 +50,10 @@ class Scores:
     detector: str
     tuned: str
     """"no", "yes" or "partly": whether the detector was tuned on these frames; "" where nobody tells."""
+    radius_m: float
+    """How near a detection has to be to a head."""
+    clear_m: float
+    """How far a detection that is left over has to be from any true head to be false."""
     frames: int
     """Frames with labels; only those count."""
     heads: int
@@ -137,6 +141,8 @@ def score(
         scenario=scenario,
         detector=detector,
         tuned=tuned,
+        radius_m=rules.radius_m,
+        clear_m=rules.clear_m,
         frames=len(pairings),
         heads=len(rows.frames),
         found=found,

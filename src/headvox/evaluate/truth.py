@@ -33,8 +33,7 @@ class TrueHeads:
     ``ids``         (N,)   int64, the person; ``NO_ID`` where not told
     ``ignored``     (N,)   bool: neither hit nor miss
     ``truncated``   (N,)   bool: cut by the border of the image
-    ``visible``     (N,)   float64, 0..1, the share that is seen by the sensor that sees most; NaN where not told
-    ``views``       (N,)   float64, how many sensors see at least 15 % of it; NaN where not told
+    ``shares``      for each head, sensor -> the share that is seen by it, 0..1; empty where not told
     ``labels``      name -> N words, "" where not told
     """
 
@@ -44,12 +43,22 @@ class TrueHeads:
     ids: I64
     ignored: Bools
     truncated: Bools
-    visible: F64
-    views: F64
+    shares: tuple[Mapping[str, float], ...]
     labels: Mapping[str, tuple[str, ...]]
 
     def __len__(self) -> int:
         return len(self.centres)
+
+    @property
+    def visible(self) -> F64:
+        """The share of each head (N,) that the sensor that sees most of it sees; NaN where not told."""
+        return np.array([max(seen.values(), default=math.nan) for seen in self.shares], np.float64)
+
+    @property
+    def views(self) -> F64:
+        """How many sensors see at least 15 % of each head (N,); NaN where not told."""
+        counts = [sum(share >= LEAST_SEEN for share in seen.values()) for seen in self.shares]
+        return np.where([bool(seen) for seen in self.shares], counts, math.nan).astype(np.float64)
 
     @staticmethod
     def of(stamp_ns: int, heads: Sequence[Mapping[str, Any]], name: str = "heads") -> TrueHeads:
@@ -58,7 +67,6 @@ class TrueHeads:
         Raises:
             HeadvoxError: an entry that is not as described; ``name`` says where.
         """
-        seen = [_visible(head, name) for head in heads]
         return TrueHeads(
             stamp_ns,
             np.array([numbers(head.get("centre"), 3, f"{name}: centre") for head in heads]).reshape(-1, 3),
@@ -66,10 +74,7 @@ class TrueHeads:
             np.array([_id(head.get("id"), name) for head in heads], np.int64),
             np.array([_flag(head, "ignore", name) for head in heads], bool),
             np.array([_flag(head, "truncated", name) for head in heads], bool),
-            np.array([max(shares, default=math.nan) for shares in seen], np.float64),
-            np.array(
-                [sum(s >= LEAST_SEEN for s in shares) if shares else math.nan for shares in seen], np.float64
-            ),
+            tuple(_shares(head, name) for head in heads),
             {label: tuple(_word(head, label, name) for head in heads) for label in LABELS},
         )
 
@@ -176,8 +181,8 @@ def _word(head: Mapping[str, Any], key: str, name: str) -> str:
     return value
 
 
-def _visible(head: Mapping[str, Any], name: str) -> list[float]:
+def _shares(head: Mapping[str, Any], name: str) -> dict[str, float]:
     shares = head.get("visible") or {}
     if not isinstance(shares, dict):
         raise HeadvoxError(f"{name}: expected camera: share under 'visible'.", "See docs/conventions.md.")
-    return numbers(list(shares.values()), len(shares), f"{name}: visible")
+    return dict(zip(shares, numbers(list(shares.values()), len(shares), f"{name}: visible"), strict=True))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import I64
+from headvox.data import F32, I64
 from headvox.errors import HeadvoxError
 from headvox.mesh import sample_surface, triangulate
 from headvox.sources.check import Column, as_points, check_cloud
@@ -83,17 +83,9 @@ def read_ply(data: bytes, name: str) -> CloudFile:
         HeadvoxError: no valid header, no x y z, data that end early, faces that name no vertex, or a surface
             far too large.
     """
-    encoding, elements, body_start = _header(data, name)
-    if encoding == "ascii":  # an ASCII body becomes a binary one in which everything is a double
-        body = parse_numbers(data[body_start:], name).view(np.uint8)
-    else:
-        body = np.frombuffer(data, dtype=np.uint8, offset=body_start)
-    tables = _tables(body, elements, name)
-
+    encoding, body, tables = _open(data, name)
     vertex, face = tables["vertex"], tables.get("face")
-    vertices = as_points(*(_scalars(body, vertex, axis, name) for axis in "xyz"))
-    check_cloud(vertices, name)  # before a surface in millimetres fills the memory
-    triangles = triangulate(_polygons(body, face) if face else ())
+    vertices, triangles = _surface(body, tables, name)
     return CloudFile(
         format=f"ply, {encoding.replace('_', ' ')}",
         points=sample_surface(vertices, triangles, name=name) if len(triangles) else vertices,
@@ -101,6 +93,33 @@ def read_ply(data: bytes, name: str) -> CloudFile:
         faces=face.count if face else 0,
         extra=tuple(p.name for p in vertex.element.properties if p.name not in ("x", "y", "z")),
     )
+
+
+def read_ply_mesh(data: bytes, name: str) -> tuple[F32, I64]:
+    """Return the vertices (V, 3), metres, and the triangles (F, 3) of a PLY file, polygons cut up.
+
+    Raises:
+        HeadvoxError: as :func:`read_ply`.
+    """
+    _, body, tables = _open(data, name)
+    return _surface(body, tables, name)
+
+
+def _open(data: bytes, name: str) -> tuple[str, Bytes, dict[str, Table]]:
+    """Return the encoding, the body, and where everything lies in it."""
+    encoding, elements, body_start = _header(data, name)
+    if encoding == "ascii":  # an ASCII body becomes a binary one in which everything is a double
+        body = parse_numbers(data[body_start:], name).view(np.uint8)
+    else:
+        body = np.frombuffer(data, dtype=np.uint8, offset=body_start)
+    return encoding, body, _tables(body, elements, name)
+
+
+def _surface(body: Bytes, tables: dict[str, Table], name: str) -> tuple[F32, I64]:
+    vertices = as_points(*(_scalars(body, tables["vertex"], axis, name) for axis in "xyz"))
+    check_cloud(vertices, name)  # before a surface in millimetres fills the memory
+    face = tables.get("face")
+    return vertices, triangulate(_polygons(body, face) if face else ())
 
 
 def _header(data: bytes, name: str) -> tuple[str, list[Element], int]:

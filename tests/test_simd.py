@@ -4,12 +4,26 @@ import numpy as np
 import pytest
 
 from headvox.kernels import bare_kernel
-from headvox.simd import LANES, add, fill, less, load, lowest, store, sub, times, within
+from headvox.simd import (
+    LANES,
+    add,
+    choose,
+    fill,
+    larger,
+    less,
+    load,
+    lowest,
+    smaller,
+    store,
+    sub,
+    times,
+    within,
+)  # fmt: skip
 
 
 @bare_kernel
 def arithmetic(a, b, at, factor, out):
-    """Write a + b, a - b, a * factor, a < b and a number, each in a row of ``out``."""
+    """Write what each operation gives to a row of ``out``."""
     x, y = load(a, at), load(b, at)
     flat = out.reshape(-1)
     store(flat, 0, add(x, y))
@@ -17,6 +31,9 @@ def arithmetic(a, b, at, factor, out):
     store(flat, 2 * LANES, times(x, factor))
     store(flat, 3 * LANES, less(x, y))
     store(flat, 4 * LANES, fill(a[at]))
+    store(flat, 5 * LANES, smaller(x, y))
+    store(flat, 6 * LANES, larger(x, y))
+    store(flat, 7 * LANES, choose(x, b[at], x, y))
 
 
 @bare_kernel
@@ -37,16 +54,17 @@ def test_equals_numpy(dtype, at):
     a, b = rng.integers(info.min, info.max, (2, 64), dtype, endpoint=True)
     b[::3] = a[::3]
     a[at], b[at + 1] = info.max, info.min
-    out = np.zeros((5, LANES), dtype)
+    out = np.zeros((8, LANES), dtype)
     arithmetic(a, b, at, 3, out)
     x, y = a[at : at + LANES], b[at : at + LANES]
     signed = np.dtype(f"i{x.itemsize}")
-    np.testing.assert_array_equal(
-        out, [x + y, x - y, x * dtype(3), x.view(signed) < y.view(signed), np.full(LANES, x[0])]
-    )
-    low, high = sorted(x.view(signed)[[3, 9]].tolist())
+    p, q = x.view(signed), y.view(signed)
+    rows = [x + y, x - y, x * dtype(3), p < q, np.full(LANES, x[0])]
+    rows += [row.view(dtype) for row in (np.minimum(p, q), np.maximum(p, q), np.where(p <= q[0], p, q))]
+    np.testing.assert_array_equal(out, rows)
+    low, high = sorted(p[[3, 9]].tolist())
     bits = between(a, at, low, high)
-    wanted = (x.view(signed) >= low) & (x.view(signed) <= high)
+    wanted = (p >= low) & (p <= high)
     assert [bool(bits >> lane & 1) for lane in range(LANES)] == wanted.tolist()
     assert 0 < wanted.sum() < LANES
 

@@ -8,7 +8,8 @@ from test_gate import narrow, random_cells
 
 from headvox.integral import integral_volume
 from headvox.masks import Stage, compile_cascade, load_cascade, parse_cascade, shipped_cascades
-from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes
+from headvox.simd import LANES
+from headvox.vote import DROPPED, _statistics, score_by_stages, score_by_votes, seen_boxes
 
 SMALL = parse_cascade(scenes.STAGES, "small")
 SMALL_VOTES = parse_cascade(scenes.VOTES, "small votes")
@@ -132,6 +133,19 @@ def test_random_trees_equal_the_naive_twin(seed):
             naive.score_by_stages(naive.weights(grid), cell, cascade, 0.05, states_known) for cell in cells
         ]
         assert score_by_stages(S, cells, compiled.stages, known).tolist() == wanted
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 5, 6, 7, 8, 33, 64])
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+def test_statistics_are_those_of_the_sorted_sums(count, dtype):
+    sums = np.random.default_rng(count).integers(0, 20, (64, LANES)).astype(dtype)
+    features = np.full((7, LANES), -1, dtype)
+    wanted = np.sort(sums[:count], axis=0)
+    _statistics(sums.reshape(-1), count, count > 1, features.reshape(-1), LANES)
+    np.testing.assert_array_equal(features[5], wanted.sum(axis=0))
+    if count > 1:
+        np.testing.assert_array_equal(features[1:5], wanted[[0, 2, count - 3, count - 1]])
+    assert (features[[0, 6]] == -1).all()
 
 
 @pytest.mark.parametrize("keep", [0.4999, 0.5, 0.5001, -0.0001, 0.0])

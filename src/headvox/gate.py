@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.integral import Integral, set_corners
+from headvox.integral import Integral, box_reach, set_corners
 from headvox.kernels import bare_kernel, rule
 from headvox.masks import CompiledGate
 from headvox.simd import LANES, add, fill, less, load, lowest, sub, times, within
@@ -116,12 +116,6 @@ def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
         np.int64
     )
     return np.concatenate([np.minimum(reach[:3], 0), np.maximum(reach[3:], 0)])
-
-
-def box_reach(boxes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-    """Return the box that holds all of ``boxes`` (B, 6) and the voxel that they are about."""
-    low, high = boxes[:, 0::2].min(axis=0, initial=0), boxes[:, 1::2].max(axis=0, initial=1)
-    return np.stack([low, high], axis=1).reshape(-1).astype(np.int64)
 
 
 def padded(height: int) -> int:

@@ -114,3 +114,9 @@ def box_sums(S: Integral, boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32
     out = np.empty(len(boxes), dtype=np.uint32)
     _box_sums(S, np.ascontiguousarray(boxes, dtype=np.int64), out)
     return out
+
+
+def box_reach(boxes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+    """Return the box that holds all of ``boxes`` (B, 6) and the voxel that they are about."""
+    low, high = boxes[:, 0::2].min(axis=0, initial=0), boxes[:, 1::2].max(axis=0, initial=1)
+    return np.stack([low, high], axis=1).reshape(-1).astype(np.int64)

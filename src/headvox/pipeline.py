@@ -16,14 +16,14 @@ from headvox.data import F64, Cloud, DepthImage, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import GateTables, box_reach, candidate_reach, gate_columns, padded
-from headvox.integral import integrate
+from headvox.gate import GateTables, candidate_reach, gate_columns, padded
+from headvox.integral import box_reach, integrate
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
 from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
 from headvox.suppress import local_maxima, suppress_overlaps
 from headvox.visibility import camera_table, cells_of, count_states, look_about
-from headvox.vote import DROPPED, feature_count, seen_boxes, stage_tables, vote_masks, vote_stages
+from headvox.vote import DROPPED, StageTables, seen_boxes, set_box_corners, vote_masks, vote_stages
 from headvox.voxelize import (
     Lattice,
     Rays,
@@ -197,6 +197,8 @@ class Detector:
         memory.make_room(len(survivors))
         scores, parts = memory.scores[: len(survivors)], self._threads.count
         votes, stages = self.cascade.votes, self.cascade.stages
+        if stages is not None:
+            set_box_corners(S, stages.boxes, memory.corners)
 
         def score(part: int) -> None:
             low, high = _share(len(survivors), part, parts)
@@ -208,7 +210,7 @@ class Detector:
             elif stages is not None:
                 vote_stages(
                     S, survivors, memory.seen, low, high, stages.occupied_stages, *memory.tables,
-                    memory.corners[part], memory.features[part], scores,
+                    memory.corners, memory.alive, *memory.stages[part], scores,
                 )  # fmt: skip
 
         self._threads.run(score, [(part,) for part in range(parts)])
@@ -247,8 +249,9 @@ class Detector:
                 len(cells),
                 len(stages.stage_keep),
                 *memory.tables,
-                memory.corners[0],
-                memory.features[0],
+                memory.corners,
+                memory.alive,
+                *memory.stages[0],
                 judged,
             )
             scores[peaks] = judged
@@ -347,15 +350,15 @@ class _Memory:
         self.seen = np.zeros((1, 1, 2), np.int32)
         self.offsets, self.offset_start = np.empty((0, 3), np.int32), np.zeros(1, np.int32)
         self.tables: tuple[Any, ...] = ()
-        self.features = [np.empty(0, np.int64)] * threads
-        self.corners = [np.empty((0, 8), np.uint64)] * threads
+        self.corners = np.empty((0, 8), np.int64)
+        self.stages: list[tuple[Any, ...]] = [()] * threads
         self.sees = cascade.source.sees
         if cascade.stages is not None:
-            boxes, seen_start = seen_boxes(cascade.stages)
+            boxes, _ = seen_boxes(cascade.stages)
             self.offsets, self.offset_start = cells_of(boxes)
-            self.tables = stage_tables(cascade.stages, seen_start)
-            self.corners = [np.empty((len(cascade.stages.boxes), 8), np.uint64) for _ in range(threads)]
-            self.features = [np.zeros(feature_count(cascade.stages), np.int64) for _ in range(threads)]
+            self.corners = np.empty((len(cascade.stages.boxes), 8), np.int64)
+            tables = StageTables.of(cascade.stages, self.S.dtype)
+            self.tables, self.stages = tables.tables, [tables.memory() for _ in range(threads)]
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 
@@ -377,6 +380,7 @@ class _Memory:
         """Have room for as many candidates."""
         if len(self.scores) < candidates:
             self.scores = np.empty(2 * candidates, np.int64)
+            self.alive = np.empty(2 * candidates, np.int64)
             self.yaws = np.zeros(2 * candidates, np.int32)
             self.peaks = np.empty(2 * candidates, np.int64)
 

@@ -90,6 +90,29 @@ def times(typingctx, a, factor):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def smaller(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return the smaller of a and b as signed numbers, lane by lane."""
+    return _two(a, b, lambda builder, x, y: builder.select(builder.icmp_signed("<", x, y), x, y))
+
+
+@intrinsic
+def larger(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return the larger of a and b as signed numbers, lane by lane."""
+    return _two(a, b, lambda builder, x, y: builder.select(builder.icmp_signed(">", x, y), x, y))
+
+
+@intrinsic
+def choose(typingctx, x, cut, at_most, above):  # type: ignore[no-untyped-def]
+    """Return ``at_most`` where x <= cut, a number of the lanes' type, and ``above`` elsewhere."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        lanes, number, yes, no = arguments
+        return builder.select(builder.icmp_signed("<=", lanes, _spread(builder, number)), yes, no)
+
+    return (x(x, x.scalar, x, x), emit) if x == at_most == above else None
+
+
+@intrinsic
 def less(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return 1 where a < b as signed numbers and 0 elsewhere."""
     return _two(a, b, lambda builder, x, y: builder.zext(builder.icmp_signed("<", x, y), x.type))
@@ -127,12 +150,15 @@ def _two(a: Any, b: Any, emit_on_vectors: Any) -> Any:
     return (a(a, b), emit) if a == b else None
 
 
+def _vector(bits: int) -> Any:
+    return ir.VectorType(ir.IntType(bits), LANES)
+
+
 def _spread(builder: Any, value: Any) -> Any:
     """Return a vector with ``value`` in every lane."""
-    vector = ir.VectorType(value.type, LANES)
-    first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
+    nothing = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
+    first = builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(_vector(32), [0] * LANES))
 
 
 def _pointer(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

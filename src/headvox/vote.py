@@ -9,16 +9,19 @@ integers; after each stage a candidate below the stage's threshold is dropped, s
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from headvox.integral import Integral, box_sum, set_corners
-from headvox.kernels import kernel, rule
+from headvox.integral import Integral, box_reach, box_sum, set_corners
+from headvox.kernels import bare_kernel, kernel, rule
 from headvox.masks import SCORE_UNIT, STATISTICS, CompiledStages, CompiledVotes
+from headvox.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
 
 DROPPED = -(1 << 40)
+OUTSIDE = np.uint64(1 << 63)
 FEATURES_PER_GROUP = len(STATISTICS)
 
 I32 = npt.NDArray[np.int32]
@@ -93,93 +96,151 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
 # ---------------------------------------------------------------------------------------------------- boosted
 
 
-@rule
-def _statistics(sums, count, ranked, out):  # type: ignore[no-untyped-def]
-    """Write smallest, 3rd smallest, 3rd largest and largest of ``sums`` (if ``ranked``: sorts them) and the total."""
-    total = sums[0]
-    for i in range(1, count):
-        total += sums[i]
-    out[4] = total
-    if ranked:
-        for i in range(1, count):
-            value = sums[i]
-            j = i - 1
-            while j >= 0 and sums[j] > value:
-                sums[j + 1] = sums[j]
-                j -= 1
-            sums[j + 1] = value
-        out[0] = sums[0]
-        out[1] = sums[2]
-        out[2] = sums[count - 3]
-        out[3] = sums[count - 1]
-
-
-@rule
-def _sum_at(flat, at, corner, mask):  # type: ignore[no-untyped-def]
-    """Return the sum over a box that lies within the volume: eight look-ups and no more."""
-    a = np.int64(flat[at + corner[0]]) - np.int64(flat[at + corner[1]])
-    b = np.int64(flat[at + corner[2]]) - np.int64(flat[at + corner[3]])
-    c = np.int64(flat[at + corner[4]]) - np.int64(flat[at + corner[5]])
-    d = np.int64(flat[at + corner[6]]) - np.int64(flat[at + corner[7]])
-    return (a - b - c + d) & mask
-
-
-@rule
-def _leaf(nodes, root, depth, features):  # type: ignore[no-untyped-def]
-    """Return the weight of the leaf of a tree that ``features`` lead to, without any branch to mispredict."""
-    # Unsigned, because a signed index costs a check for counting from the end.
-    at = np.uint64(root)
-    for _ in range(depth):
-        above = features[np.uint64(nodes[at])] > nodes[at + np.uint64(1)]
-        at = np.uint64(nodes[at + np.uint64(2) + np.uint64(above)])
-    return nodes[at + np.uint64(1)]
-
-
-@kernel
-def vote_stages(  # type: ignore[no-untyped-def]
-    S, cells, seen, first, last, to_stage, boxes, reach, group_start, group_channel, group_ranked, seen_start, nodes,
-    root, depth, stage_groups, stage_trees, stage_keep, corners, features, scores,
-):  # fmt: skip
-    """Write the sum of the trees of the first ``to_stage`` stages to ``scores``; DROPPED where a stage says so.
-
-    ``corners`` (boxes, 8) and ``features`` (features,) are working memory. ``seen`` (candidates, boxes of other
-    channels, 2) holds how many cells of a box are known-empty and hidden.
-    """
+@bare_kernel
+def set_box_corners(S, boxes, corners):  # type: ignore[no-untyped-def]
+    """Write where the corners of ``boxes`` lie in the flat S, from any voxel about which they lie within S."""
     for b in range(boxes.shape[0]):
         set_corners(
             S, boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3], boxes[b, 4], boxes[b, 5], corners[b]
         )
-    flat = S.reshape(-1)
+
+
+@rule
+def _sum_at(flat, at, corners, b):  # type: ignore[no-untyped-def]
+    """Return the sum over a box that lies within the volume, in the low bits: eight look-ups and no more."""
+    high = np.int64(flat[at + corners[b, 0]]) - np.int64(flat[at + corners[b, 1]])
+    high -= np.int64(flat[at + corners[b, 2]]) - np.int64(flat[at + corners[b, 3]])
+    low = np.int64(flat[at + corners[b, 4]]) - np.int64(flat[at + corners[b, 5]])
+    return high - (low - (np.int64(flat[at + corners[b, 6]]) - np.int64(flat[at + corners[b, 7]])))
+
+
+@bare_kernel
+def _rank(sums, count):  # type: ignore[no-untyped-def]
+    """Bring the three smallest of ``count`` rows to the first rows and the three largest to the last, lane by lane."""
+    for i in range(min(3, count - 1)):
+        for j in range(i + 1, count):
+            _order(sums, LANES * i, LANES * j)
+    for i in range(count - 1, max(3, count - 3) - 1, -1):
+        for j in range(3, i):
+            _order(sums, LANES * j, LANES * i)
+
+
+@rule
+def _order(sums, one, other):  # type: ignore[no-untyped-def]
+    a, b = load(sums, one), load(sums, other)
+    store(sums, one, smaller(a, b))
+    store(sums, other, larger(a, b))
+
+
+@bare_kernel
+def _statistics(sums, count, ranked, features, first):  # type: ignore[no-untyped-def]
+    """Write the statistics of ``count`` rows of ``sums`` to the rows of ``features`` from ``first`` on."""
+    total = load(sums, 0)
+    for i in range(1, count):
+        total = add(total, load(sums, LANES * i))
+    store(features, first + 4 * LANES, total)
+    if ranked:
+        _rank(sums, count)
+        store(features, first, load(sums, 0))
+        store(features, first + LANES, load(sums, 2 * LANES))
+        store(features, first + 2 * LANES, load(sums, LANES * (count - 3)))
+        store(features, first + 3 * LANES, load(sums, LANES * (count - 1)))
+
+
+@bare_kernel
+def _add_trees(first, last, leaf_start, leaves, node_start, nodes, cuts, features, values, total):  # type: ignore[no-untyped-def]
+    """Write the sum of the leaves that the trees ``first`` to ``last`` lead to, to ``total`` (LANES,).
+
+    From the leaves down to the root, every node takes the value of its one branch or of the other: no step depends on
+    where a candidate goes, so all lanes go together.
+    """
+    before = load(total, 0)
+    score = sub(before, before)
+    for t in range(first, last):
+        row = np.uint64(0)
+        for k in range(np.uint64(leaf_start[t]), np.uint64(leaf_start[t + 1])):
+            store(values, row, fill(leaves[k]))
+            row += np.uint64(LANES)
+        for k in range(np.uint64(node_start[t]), np.uint64(node_start[t + 1])):
+            at_most, above = load(values, nodes[k, 1]), load(values, nodes[k, 2])
+            store(values, row, choose(load(features, nodes[k, 0]), cuts[k], at_most, above))
+            row += np.uint64(LANES)
+        score = add(score, load(values, row - np.uint64(LANES)))
+    store(total, 0, score)
+
+
+@bare_kernel
+def _locate(S, cells, alive, begin, width, reach, at):  # type: ignore[no-untyped-def]
+    """Write where the candidates lie in the flat S to ``at``; OUTSIDE where a box about them leaves S."""
     nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
-    mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
-    sums = np.empty(64, np.int64)
-    for i in range(first, last):
+    for lane in range(width):
+        i = alive[begin + lane]
         x, y, z = np.int64(cells[i, 0]), np.int64(cells[i, 1]), np.int64(cells[i, 2])
-        at = np.uint64((x * S.shape[1] + y) * S.shape[2] + z)
         inside = (
             x + reach[0] >= 0 and x + reach[1] <= nx and y + reach[2] >= 0 and y + reach[3] <= ny
             and z + reach[4] >= 0 and z + reach[5] <= nz
         )  # fmt: skip
-        score = np.int64(0)
-        for s in range(to_stage):
-            for g in range(stage_groups[s], stage_groups[s + 1]):
-                begin, count, channel = group_start[g], group_start[g + 1] - group_start[g], group_channel[g]
+        at[lane] = (x * S.shape[1] + y) * S.shape[2] + z if inside else OUTSIDE
+
+
+@bare_kernel
+def _look_up(S, cells, alive, begin, width, at, boxes, corners, first, count, sums):  # type: ignore[no-untyped-def]
+    """Write the sums over ``count`` boxes from ``first`` on to as many rows of ``sums``, a lane a candidate."""
+    flat = S.reshape(-1)
+    mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
+    # Unsigned, because a signed index costs a check for counting from the end.
+    for k in range(np.uint64(count)):
+        row, b = k * np.uint64(LANES), np.uint64(first) + k
+        for lane in range(np.uint64(width)):
+            if at[lane] != OUTSIDE:
+                sums[row + lane] = _sum_at(flat, at[lane], corners, b) & mask
+            else:
+                i = alive[np.uint64(begin) + lane]
+                sums[row + lane] = sum_about(S, cells[i, 0], cells[i, 1], cells[i, 2], boxes[b])
+
+
+@bare_kernel
+def vote_stages(  # type: ignore[no-untyped-def]
+    S, cells, seen, first, last, to_stage, boxes, reach, group_start, group_channel, seen_start, used_start, used,
+    leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, sums, features, values,
+    total, scores,
+):  # fmt: skip
+    """Write the sum of the trees of the first ``to_stage`` stages to ``scores``; DROPPED where a stage says so.
+
+    Each stage takes the candidates that are left, LANES at a time: it looks up the groups its trees ask for, and adds
+    its trees up. ``seen`` (candidates, boxes of other channels, 2) holds how many cells of a box are known-empty and
+    hidden. ``corners`` is from :func:`set_box_corners`; ``alive`` (candidates,), ``at`` (LANES,) and the rows of LANES
+    numbers ``sums``, ``features``, ``values`` and ``total`` are working memory.
+    """
+    end = last
+    for i in range(first, last):
+        scores[i] = 0
+        alive[i] = i
+    for s in range(to_stage):
+        kept = first
+        for begin in range(first, end, LANES):
+            width = min(LANES, end - begin)
+            _locate(S, cells, alive, begin, width, reach, at)
+            for u in range(used_start[s], used_start[s + 1]):
+                g, ranked = used[u, 0], used[u, 1]
+                count, channel = group_start[g + 1] - group_start[g], group_channel[g]
                 if channel:
                     for k in range(count):
-                        sums[k] = seen[i, seen_start[g] + k, channel - 1]
-                elif inside:
-                    for k in range(count):
-                        sums[k] = _sum_at(flat, at, corners[begin + k], mask)
+                        for lane in range(width):
+                            sums[LANES * k + lane] = seen[alive[begin + lane], seen_start[g] + k, channel - 1]
                 else:
-                    for k in range(count):
-                        sums[k] = sum_about(S, x, y, z, boxes[begin + k])
-                _statistics(sums, count, group_ranked[g], features[FEATURES_PER_GROUP * g :])
-            for t in range(stage_trees[s], stage_trees[s + 1]):
-                score += _leaf(nodes, root[t], depth[t], features)
-            if score < stage_keep[s]:
-                score = np.int64(DROPPED)
-                break
-        scores[i] = score
+                    _look_up(S, cells, alive, begin, width, at, boxes, corners, group_start[g], count, sums)
+                _statistics(sums, count, ranked, features, FEATURES_PER_GROUP * LANES * g)
+            _add_trees(
+                stage_trees[s], stage_trees[s + 1], leaf_start, leaves, node_start, nodes, cuts, features, values, total
+            )  # fmt: skip
+            for lane in range(width):
+                i = alive[begin + lane]
+                scores[i] += total[lane]
+                alive[kept] = i
+                kept += scores[i] >= stage_keep[s]
+                scores[i] = scores[i] if scores[i] >= stage_keep[s] else DROPPED
+        end = kept
 
 
 def seen_boxes(stages: CompiledStages) -> tuple[I32, I32]:
@@ -193,9 +254,76 @@ def seen_boxes(stages: CompiledStages) -> tuple[I32, I32]:
     return np.array(boxes, np.int32).reshape(-1, 6), start
 
 
-def feature_count(stages: CompiledStages) -> int:
-    """Return how many features a candidate has."""
-    return FEATURES_PER_GROUP * len(stages.group_channel)
+@dataclass(frozen=True, slots=True)
+class StageTables:
+    """Boosted stages for one type of integral volume, as :func:`vote_stages` reads them."""
+
+    tables: tuple[npt.NDArray[Any], ...]
+    sizes: tuple[int, ...]
+    """Rows of sums, features and values."""
+    number: np.dtype[Any]
+    """What sums, cuts and the leaves of a stage added up fit in."""
+
+    @classmethod
+    def of(cls, stages: CompiledStages, sum_type: np.dtype[Any]) -> StageTables:
+        """Return the tables for an integral volume of ``sum_type``."""
+        nodes, depth_first = stages.nodes.reshape(-1, 4), np.arange(len(stages.nodes) // 4)
+        is_leaf = nodes[:, 2] // 4 == depth_first
+        tree = np.searchsorted(stages.root // 4, depth_first, side="right") - 1
+        leaf_start = _starts(tree[is_leaf], len(stages.root))
+        node_start = _starts(tree[~is_leaf], len(stages.root))
+        # A tree's rows are its leaves, then its other nodes from the last to the first, which are children before
+        # parents; the last row is the root's.
+        row = np.empty(len(nodes), np.int64)
+        row[is_leaf] = np.arange(is_leaf.sum()) - leaf_start[tree[is_leaf]]
+        order = np.lexsort((-depth_first, tree))
+        order = order[~is_leaf[order]]
+        row[order] = np.arange(len(order)) - node_start[tree[order]] + np.diff(leaf_start)[tree[order]]
+        inner = nodes[order]
+        table = np.column_stack([inner[:, 0], row[inner[:, 2] // 4], row[inner[:, 3] // 4]])
+        used = [
+            _groups_used(inner[node_start[first] : node_start[last], 0])
+            for first, last in zip(stages.stage_trees[:-1], stages.stage_trees[1:], strict=True)
+        ]
+        leaves = nodes[is_leaf, 1]
+        greatest = np.abs(np.concatenate([[0], leaves])).max() * np.diff(stages.stage_trees).max(initial=0)
+        narrow = sum_type.itemsize == 2 and greatest <= np.iinfo(np.int32).max
+        number = np.dtype(np.int32 if narrow else np.int64)
+        info = np.iinfo(np.int32 if narrow else np.int64)
+        looked_up = stages.boxes[np.repeat(stages.group_channel == 0, np.diff(stages.group_start))]
+        _, seen_start = seen_boxes(stages)
+        return cls(
+            (
+                stages.boxes, box_reach(looked_up), stages.group_start, stages.group_channel, seen_start,
+                np.cumsum([0, *map(len, used)]), np.concatenate(used),
+                leaf_start, leaves.astype(number), node_start, (LANES * table).astype(np.uint64),
+                np.clip(inner[:, 1], info.min, info.max).astype(number), stages.stage_trees, stages.stage_keep,
+            ),
+            (
+                int(np.diff(stages.group_start).max(initial=1)),
+                FEATURES_PER_GROUP * len(stages.group_channel),
+                int(np.bincount(tree).max()),
+            ),
+            number,
+        )  # fmt: skip
+
+    def memory(self) -> tuple[npt.NDArray[Any], ...]:
+        """Return the working memory of one thread."""
+        rows = [np.zeros(LANES * count, self.number) for count in (*self.sizes, 1)]
+        return (np.zeros(LANES, np.uint64), *rows)
+
+
+def _starts(of: I64, count: int) -> I64:
+    """Return where the items of each of ``count`` owners begin, and the end; ``of`` has the items' owners in order."""
+    return np.concatenate([[0], np.cumsum(np.bincount(of, minlength=count))])
+
+
+def _groups_used(features: I64) -> I32:
+    """Return the groups that ``features`` are of (U, 2), and whether any asks for more than the sum of the group."""
+    groups = np.unique(features // FEATURES_PER_GROUP)
+    not_sums = features[features % FEATURES_PER_GROUP != FEATURES_PER_GROUP - 1]
+    ranked = np.isin(groups, not_sums // FEATURES_PER_GROUP)
+    return np.column_stack([groups, ranked]).astype(np.int32)
 
 
 def score_by_stages(S: Integral, cells: I32, stages: CompiledStages, seen: I32 | None = None) -> I64:
@@ -204,36 +332,13 @@ def score_by_stages(S: Integral, cells: I32, stages: CompiledStages, seen: I32 |
     Without ``seen`` (candidates, boxes, 2; see :func:`headvox.visibility.count_seen`) the stages that need the
     channels "empty" and "hidden" are left out.
     """
-    _, seen_start = seen_boxes(stages)
     to_stage = stages.occupied_stages if seen is None else len(stages.stage_keep)
     seen = np.zeros((len(cells), 1, 2), np.int32) if seen is None else seen
-    scores = np.zeros(len(cells), np.int64)
-    features = np.zeros(feature_count(stages), np.int64)
-    corners = np.empty((len(stages.boxes), 8), np.uint64)
+    tables = StageTables.of(stages, S.dtype)
+    corners = np.empty((len(stages.boxes), 8), np.int64)
+    set_box_corners(S, stages.boxes, corners)
+    scores, alive = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
     vote_stages(
-        S, cells, seen, 0, len(cells), to_stage, *stage_tables(stages, seen_start), corners, features, scores
+        S, cells, seen, 0, len(cells), to_stage, *tables.tables, corners, alive, *tables.memory(), scores
     )
     return scores
-
-
-def stage_tables(stages: CompiledStages, seen_start: I32) -> tuple[npt.NDArray[Any], ...]:
-    """Return the tables of ``stages`` in the order of :func:`vote_stages`."""
-    looked_up = stages.boxes[np.repeat(stages.group_channel == 0, np.diff(stages.group_start))].astype(
-        np.int64
-    )
-    reach = np.array(
-        [(looked_up[:, k].min if k % 2 == 0 else looked_up[:, k].max)(initial=0) for k in range(6)]
-    )
-    ranked = np.zeros(len(stages.group_channel), np.bool_)
-    features = stages.nodes[0::4][_inner(stages.nodes)]
-    ranked[features[features % FEATURES_PER_GROUP != FEATURES_PER_GROUP - 1] // FEATURES_PER_GROUP] = True
-    return (
-        stages.boxes, reach, stages.group_start, stages.group_channel, ranked, seen_start, stages.nodes, stages.root,
-        stages.depth, stages.stage_groups, stages.stage_trees, stages.stage_keep,
-    )  # fmt: skip
-
-
-def _inner(nodes: I64) -> npt.NDArray[np.bool_]:
-    """Tell which nodes are no leaves: a leaf leads to itself."""
-    inner: npt.NDArray[np.bool_] = nodes[2::4] != np.arange(0, len(nodes), 4)
-    return inner

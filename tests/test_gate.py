@@ -6,7 +6,7 @@ import pytest
 import scenes
 
 from headvox.gate import pass_gate
-from headvox.integral import integral_volume, integrate
+from headvox.integral import integral_volume
 from headvox.masks import (
     Box,
     Cascade,
@@ -45,13 +45,6 @@ def cascade_with(gate: str, subdivision: int = 2, occupancy: str = "parts"):
     return replace(cascade, conditions=cascade.conditions[1:])
 
 
-def narrow(cells):
-    """Return the integral volume of ``cells`` in 16 bits."""
-    S = np.empty([n + 1 for n in cells.shape], np.uint16)
-    integrate(cells, np.array([0, 0, 0, *(n - 1 for n in cells.shape)]), cells.dtype != np.uint8, S)
-    return S
-
-
 def same_survivors(cells, cascade, voxel=None):
     """Assert that the survivors equal those of the twin, in order; return them."""
     compiled = compile_cascade(cascade, voxel)
@@ -60,7 +53,7 @@ def same_survivors(cells, cascade, voxel=None):
     assert survivors.dtype == np.int32
     np.testing.assert_array_equal(survivors, wanted)
     if not cascade.counting and compiled.largest_sum <= 0xFFFF:
-        np.testing.assert_array_equal(pass_gate(narrow(cells), compiled.gate), wanted)
+        np.testing.assert_array_equal(pass_gate(integral_volume(cells, narrow=True), compiled.gate), wanted)
     return survivors
 
 

@@ -4,7 +4,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headvox.integral import PARTS, box_sums, integral_volume, integrate
+from headvox.integral import (
+    box_reach,
+    box_sums,
+    integral_volume,
+    integrate,
+    set_corners,
+    shape_with_margins,
+    with_margins,
+)
+from headvox.simd import LANES
 
 SHAPES = [(1, 1, 1), (1, 5, 2), (7, 1, 3), (6, 5, 9)]
 
@@ -30,8 +39,14 @@ def test_equals_the_naive_twin(shape, dtype, filled):
     np.testing.assert_array_equal(box_sums(S, boxes), [naive.box_sum(amount, box) for box in boxes])
 
 
-def test_parts_are_the_number_of_bits():
-    assert PARTS.tolist() == [bin(value).count("1") for value in range(256)]
+def part_of(cells, box, first, shape, dtype, threads=1):
+    """Return the integral volume of the cells in ``box``, as ``threads`` threads make it."""
+    S, counting = np.full(shape, 77, dtype), cells.dtype != np.uint8
+    spare, row = np.full(LANES, 9, cells.dtype), np.full(shape[2] + LANES, 9, dtype)
+    for k in reversed(range(threads)):
+        rows = shape[1] * k // threads, shape[1] * (k + 1) // threads
+        integrate(cells, np.array(box), np.array(first), counting, *rows, spare, row, S)
+    return S
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 10))
@@ -50,8 +65,8 @@ def test_box_sums_are_exact_though_the_volume_overflows_16_bits():
     rng = np.random.default_rng(0)
     cells = np.full((40, 30, 20), 255, np.uint8)
     cells[rng.random(cells.shape) < 0.1] = 0
-    S = np.empty([n + 1 for n in cells.shape], np.uint16)
-    integrate(cells, np.array([0, 0, 0, 39, 29, 19]), False, S)
+    S = integral_volume(cells, narrow=True)
+    assert S.dtype == np.uint16
     amount = naive.weights(cells)
     assert amount.sum() > 2 * 0xFFFF
     boxes = random_boxes(rng, cells.shape)
@@ -63,15 +78,18 @@ def test_box_sums_are_exact_though_the_volume_overflows_16_bits():
 
 
 @pytest.mark.parametrize("counting", [False, True])
-def test_a_part_of_the_grid(counting):
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("height", [5, 32, 41])
+def test_a_part_of_the_grid(counting, threads, height):
     """The volume of a box of cells is the volume of a copy of these cells."""
-    rng = np.random.default_rng(1)
-    cells = rng.integers(0, 256, (9, 8, 7)).astype(np.uint32 if counting else np.uint8)
+    rng = np.random.default_rng(height)
+    cells = rng.integers(0, 256, (9, 8, height)).astype(np.uint32 if counting else np.uint8)
     cells[rng.random(cells.shape) < 0.5] = 0
-    box = np.array([2, 1, 3, 7, 7, 5])
-    S = np.full((7, 8, 4), 77, np.uint32)
-    integrate(cells, box, counting, S)
-    np.testing.assert_array_equal(S, naive.integral_volume(cells[2:8, 1:8, 3:6]))
+    for low, high in ((0, height - 1), (3, height - 2), (1, 1)):
+        S = part_of(cells, [2, 1, low, 7, 7, high], [2, 1, low], (7, 8, 64), np.uint32, threads)
+        wanted = naive.integral_volume(cells[2:8, 1:8, low : high + 1])
+        np.testing.assert_array_equal(S[:, :, : high - low + 2], wanted)
+        assert (S[:, :, high - low + 2 :] == wanted[:, :, -1:]).all()
 
 
 def test_a_million_points_in_one_cell():
@@ -88,12 +106,31 @@ def test_a_million_points_in_one_cell():
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.uint32])
-def test_a_volume_longer_than_its_cells_goes_on_over_empty_ones(dtype):
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_volume_wider_than_its_cells_goes_on_over_empty_ones(dtype, threads):
     rng = np.random.default_rng(2)
     cells = rng.integers(0, 256, (6, 5, 9)).astype(np.uint8)
     cells[3] = 0
-    S = np.full((5, 5, 16), 77, dtype)
-    integrate(cells, np.array([1, 1, 2, 4, 4, 7]), False, S)
-    padded = np.zeros((4, 4, 15), np.uint8)
-    padded[:, :, :6] = cells[1:5, 1:5, 2:8]
-    np.testing.assert_array_equal(S, naive.integral_volume(padded))
+    S = part_of(cells, [1, 1, 2, 4, 3, 7], [-1, -2, -3], (9, 8, 32), dtype, threads)
+    wider = np.zeros((8, 7, 31), np.uint8)
+    wider[2:6, 3:6, 5:11] = cells[1:5, 1:4, 2:8]
+    np.testing.assert_array_equal(S, naive.integral_volume(wider))
+
+
+def test_with_margins_every_box_about_every_voxel_lies_in_the_volume():
+    rng = np.random.default_rng(3)
+    cells = rng.integers(0, 256, (4, 3, 37)).astype(np.uint8)
+    boxes = np.array([[-2, 1, 0, 4, -3, 2], [1, 3, -1, 0, 0, 5]], np.int32)
+    reach = box_reach(boxes)
+    assert reach.tolist() == [-2, 3, -1, 4, -3, 5]
+    S = with_margins(integral_volume(cells), reach)
+    assert S.shape == shape_with_margins(cells.shape, reach) == (9, 8, 96)
+    corners = np.empty((2, 8), np.uint64)
+    set_corners(S, boxes, corners)
+    amount, flat = naive.weights(cells), S.reshape(-1).astype(np.int64)
+    for x, y, z in np.argwhere(cells >= 0).tolist():
+        at = np.uint64(((x + 2) * S.shape[1] + y + 1) * S.shape[2] + z + 3)
+        for box, corner in zip(boxes, corners, strict=True):
+            a, b, c, d, e, f, g, h = flat[at + corner]
+            wanted = naive.box_sum(amount, naive.about((x, y, z), box))
+            assert (a - b - (c - d) - (e - f - (g - h))) % 2**32 == wanted

@@ -7,18 +7,23 @@ from headvox.kernels import bare_kernel
 from headvox.simd import (
     LANES,
     add,
+    beginning,
+    bit_counts,
     choose,
     fill,
     larger,
+    last,
     less,
     load,
     lowest,
+    running_sums,
     smaller,
     store,
     sub,
     times,
+    widen,
     within,
-)  # fmt: skip
+)
 
 
 @bare_kernel
@@ -34,6 +39,17 @@ def arithmetic(a, b, at, factor, out):
     store(flat, 5 * LANES, smaller(x, y))
     store(flat, 6 * LANES, larger(x, y))
     store(flat, 7 * LANES, choose(x, b[at], x, y))
+
+
+@bare_kernel
+def in_rows(a, at, count, out, wide):
+    """Write what is done within the lanes of one vector to a row of ``out`` each, and the lanes widened to ``wide``."""
+    x, flat = load(a, at), out.reshape(-1)
+    store(flat, 0, running_sums(x))
+    store(flat, LANES, last(x))
+    store(flat, 2 * LANES, beginning(x, count))
+    store(flat, 3 * LANES, bit_counts(x))
+    store(wide, 0, widen(x, load(wide, 0)))
 
 
 @bare_kernel
@@ -72,3 +88,19 @@ def test_equals_numpy(dtype, at):
 def test_lowest_bit():
     for bit in range(LANES):
         assert first_of(np.uint32((1 << bit) | (1 << 31))) == bit
+
+
+@pytest.mark.parametrize(
+    ("dtype", "wider"),
+    [(np.uint8, np.uint16), (np.uint8, np.uint32), (np.uint16, np.uint16), (np.uint32, np.uint32)],
+)
+@pytest.mark.parametrize("count", [-3, 0, 1, 17, 32, 40])
+def test_what_is_done_within_a_vector(dtype, wider, count):
+    a = np.random.default_rng(5).integers(0, np.iinfo(dtype).max, 50, dtype, endpoint=True)
+    out, wide = np.zeros((4, LANES), dtype), np.zeros(LANES, wider)
+    in_rows(a, 3, count, out, wide)
+    x = a[3 : 3 + LANES]
+    counts = [int(value).bit_count() for value in x]
+    kept = np.where(np.arange(LANES) < count, x, 0)
+    np.testing.assert_array_equal(out, [np.cumsum(x, dtype=dtype), np.full(LANES, x[-1]), kept, counts])
+    np.testing.assert_array_equal(wide, x)

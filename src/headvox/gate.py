@@ -7,31 +7,17 @@ corners of a box about them lie next to each other. A condition ends in 32 bits;
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from headvox.integral import Integral, box_reach, set_corners
+from headvox.integral import Integral, box_reach, set_corners, with_margins
 from headvox.kernels import bare_kernel, rule
 from headvox.masks import CompiledGate
 from headvox.simd import LANES, add, fill, less, load, lowest, sub, times, within
 
 EVEN, ALL = np.uint32(0x55555555), np.uint32(0xFFFFFFFF)
-
-
-@rule
-def _set_corners(S, x, y, boxes, corners):  # type: ignore[no-untyped-def]
-    """Write where the corners of boxes about the column x, y lie in the flat S, from an entry of that column.
-
-    In x and y a box is cut off at the edges of S; in z it has to lie within S.
-    """
-    nx, ny = S.shape[0] - 1, S.shape[1] - 1
-    for b in range(boxes.shape[0]):
-        x0, x1 = min(max(x + boxes[b, 0], 0), nx) - x, min(max(x + boxes[b, 1], 0), nx) - x
-        y0, y1 = min(max(y + boxes[b, 2], 0), ny) - y, min(max(y + boxes[b, 3], 0), ny) - y
-        set_corners(S, x0, x1, y0, y1, boxes[b, 4], boxes[b, 5], corners[b])
 
 
 @rule
@@ -65,24 +51,22 @@ def _holds(flat, at, corners, weights, start, rank, limits, i):  # type: ignore[
 
 @bare_kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S, first, last, bottom, top, boxes, weights, start, rank, limits, reach, every_other, odd, corners, survivors,
-):  # fmt: skip
+    S, region, first, last, weights, start, rank, limits, every_other, odd, corners, survivors
+):
     """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many.
 
-    Only voxels from ``bottom`` to ``top`` count; S has to go on for as long as the boxes about them reach, rounded up
-    to whole vectors. With ``every_other``, only voxels whose x + y + z + ``odd`` is even count. ``corners`` (boxes, 8)
-    is working memory. Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
+    ``region`` is y0 y1 z0 z1: the voxels of a slice that count. S has margins about them, see
+    :func:`headvox.integral.shape_with_margins`. With ``every_other``, only voxels whose x + y + z + ``odd`` is even
+    count. ``corners`` are those of the gate's boxes. Counting goes on past the end of ``survivors``, so that the caller
+    can tell how many did not fit.
     """
-    ny, length = S.shape[1] - 1, S.shape[2]
     flat = S.reshape(-1)
-    near, far = -reach[2], reach[3]
+    bottom, height = region[2], region[3] - region[2]
     found = 0
     for x in range(first, last):
-        for y in range(ny):
-            if y <= near or y + far > ny:  # in between, nothing is cut off in y
-                _set_corners(S, x, y, boxes, corners)
-            column = (x * (ny + 1) + y) * length + bottom
-            for z in range(0, top - bottom, LANES):
+        for y in range(region[0], region[1]):
+            column = (x * S.shape[1] + y) * S.shape[2] + bottom
+            for z in range(0, height, LANES):
                 alive = EVEN << np.uint32((x + y + bottom + odd) & 1) if every_other else ALL
                 for i in range(np.uint64(rank.shape[0])):
                     alive &= _holds(flat, column + z, corners, weights, start, rank, limits, i)
@@ -91,7 +75,7 @@ def gate_columns(  # type: ignore[no-untyped-def]
                 while alive:
                     voxel = z + lowest(alive)
                     alive &= alive - np.uint32(1)
-                    if voxel < top - bottom:
+                    if voxel < height:
                         if found < survivors.shape[0]:
                             survivors[found, 0] = x
                             survivors[found, 1] = y
@@ -118,31 +102,12 @@ def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
     return np.concatenate([np.minimum(reach[:3], 0), np.maximum(reach[3:], 0)])
 
 
-def padded(height: int) -> int:
-    """Return the least whole number of vectors that holds ``height`` voxels."""
-    return -(-height // LANES) * LANES
-
-
-@dataclass(frozen=True, slots=True)
-class GateTables:
-    """A gate for one type of integral volume, and the working memory of one thread."""
-
-    tables: tuple[npt.NDArray[Any], ...]
-    """Boxes, weights, starts, ranks, limits in the type of the sums, and how far the boxes reach."""
-    every_other: bool
-    corners: npt.NDArray[np.int64]
-
-    @classmethod
-    def of(cls, gate: CompiledGate, sum_type: np.dtype[Any]) -> GateTables:
-        """Return the tables for an integral volume of ``sum_type``."""
-        signed = np.dtype(f"i{sum_type.itemsize}")
-        least, greatest = np.iinfo(signed).min, np.iinfo(signed).max
-        limits = np.clip(np.stack([gate.low, gate.high], axis=1), least, greatest).astype(signed)
-        return cls(
-            (gate.boxes, gate.weights, gate.start, gate.rank, limits, box_reach(gate.boxes)),
-            gate.every_other,
-            np.empty((len(gate.boxes), 8), np.int64),
-        )
+def gate_tables(gate: CompiledGate, sum_type: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
+    """Return the gate as :func:`gate_columns` reads it, for an integral volume of ``sum_type``."""
+    signed = np.dtype(f"i{sum_type.itemsize}")
+    least, greatest = np.iinfo(signed).min, np.iinfo(signed).max
+    limits = np.clip(np.stack([gate.low, gate.high], axis=1), least, greatest).astype(signed)
+    return gate.weights, gate.start, gate.rank, limits
 
 
 def pass_gate(S: Integral, gate: CompiledGate, odd: int = 0) -> npt.NDArray[np.int32]:
@@ -151,15 +116,15 @@ def pass_gate(S: Integral, gate: CompiledGate, odd: int = 0) -> npt.NDArray[np.i
     ``odd`` is that of the lattice, for a gate that looks at every other voxel only.
     """
     reach = box_reach(gate.boxes)
-    below, above = -int(reach[4]), int(reach[5])
-    height = S.shape[2] - 1
-    longer = np.pad(S, ((0, 0), (0, 0), (below, padded(height) - height + above)), mode="edge")
-    longer[:, :, :below] = 0
-    tables = GateTables.of(gate, S.dtype)
-    arguments = (longer, 0, S.shape[0] - 1, below, below + height, *tables.tables)
-    arguments += (gate.every_other, odd + below, tables.corners)
+    longer = with_margins(S, reach)
+    low = -reach[0::2]
+    high = low + S.shape - 1
+    corners = np.empty((len(gate.boxes), 8), np.uint64)
+    set_corners(longer, gate.boxes, corners)
+    region = np.array([low[1], high[1], low[2], high[2]])
+    arguments = (longer, region, low[0], high[0], *gate_tables(gate, S.dtype))
+    arguments += (gate.every_other, odd + low.sum(), corners)
     count = gate_columns(*arguments, np.empty((0, 3), np.int32))
     survivors = np.empty((count, 3), np.int32)
     gate_columns(*arguments, survivors)
-    survivors[:, 2] -= below
-    return survivors
+    return survivors - low.astype(np.int32)

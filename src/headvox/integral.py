@@ -16,55 +16,62 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.kernels import kernel, rule
-
-PARTS = np.array([value.bit_count() for value in range(256)], dtype=np.uint8)
+from headvox.kernels import bare_kernel, kernel, rule
+from headvox.simd import LANES, add, beginning, bit_counts, last, load, running_sums, store, sub, widen
 
 Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
 
 
-@kernel
-def integrate(cells, box, counting, S):  # type: ignore[no-untyped-def]
-    """Fill ``S`` (bx+1, by+1, bz+1 or longer) with the integral volume of the cells in ``box``.
+@bare_kernel
+def integrate(cells, box, first, counting, y_first, y_last, spare, row, S):  # type: ignore[no-untyped-def]
+    """Fill the columns ``y_first`` to ``y_last`` of ``S`` with the integral volume of the cells in ``box``.
 
-    ``box`` is lowest and highest cell (inclusive). In z it may begin below the grid, and S may be longer: the cells
-    there are taken for empty. A parts grid is summed by its bits.
+    ``box`` is lowest and highest cell (inclusive); what lies outside of it counts as empty. S[0, 0, 0] is at the lower
+    corner of the cell ``first``, which may lie before the grid, and S may go on behind it; it is a whole number of
+    vectors high. A parts grid is summed by its bits. ``spare`` (LANES cells) and ``row`` (LANES more than S is high)
+    are working memory.
     """
-    x0, y0, z0 = box[0], box[1], box[2]
-    nx, ny, length = S.shape[0] - 1, S.shape[1] - 1, S.shape[2]
-    first = max(-z0, 0)
-    nz = min(min(box[5] + 1, cells.shape[2]) - (z0 + first), length - 1 - first)
-    row = np.empty(length, S.dtype)
-    S[0] = 0
-    for x in range(nx):
-        row[:] = 0
-        S[x + 1, 0] = 0
-        for y in range(ny):
-            column = cells[x0 + x, y0 + y, z0 + first : z0 + first + nz]
-            if _any(column):
-                sums = row[first + 1 : first + 1 + nz]
-                total = 0
-                if counting:
-                    for z in range(nz):
-                        total += column[z]
-                        sums[z] += total
-                else:
-                    for z in range(nz):
-                        total += PARTS[column[z] & 255]
-                        sums[z] += total
-                row[first + 1 + nz :] = row[first + nz]
-            below = S[x, y + 1]
-            out = S[x + 1, y + 1]
-            for z in range(length):
-                out[z] = below[z] + row[z]
+    flat, grid = S.reshape(-1), cells.reshape(-1)
+    columns, length = S.shape[1], S.shape[2]
+    bottom, height = box[2] - first[2] + 1, box[5] - box[2] + 1
+    none = load(row, 0)
+    none = sub(none, none)
+    for z in range(y_first * length, y_last * length, LANES):
+        store(flat, z, none)
+    for x in range(S.shape[0] - 1):
+        for z in range(0, row.shape[0], LANES):
+            store(row, z, none)
+        occupied = box[0] <= first[0] + x <= box[3]
+        for y in range(y_last):
+            if occupied and box[1] < first[1] + y <= box[4] + 1:
+                column = ((first[0] + x) * cells.shape[1] + first[1] + y - 1) * cells.shape[2] + box[2]
+                _add_column(grid, column, height, counting, spare, row, bottom)
+            if y >= y_first:
+                before = (x * columns + y) * length
+                after = before + columns * length
+                for z in range(0, length, LANES):
+                    store(flat, after + z, add(load(flat, before + z), load(row, z)))
 
 
-@rule
-def _any(column):  # type: ignore[no-untyped-def]
-    bits = 0
-    for z in range(column.shape[0]):
-        bits |= column[z]
-    return bits != 0
+@bare_kernel
+def _add_column(grid, at, height, counting, spare, row, bottom):  # type: ignore[no-untyped-def]
+    """Add to ``row``, from ``bottom`` on, what is in the column that begins at ``at``, up to each of its cells."""
+    total = load(row, 0)
+    total = sub(total, total)
+    for z in range(0, height, LANES):
+        if at + z + LANES <= grid.shape[0]:
+            cells = load(grid, at + z)
+        else:
+            for k in range(min(height - z, LANES)):
+                spare[k] = grid[at + z + k]
+            cells = load(spare, 0)
+        cells = beginning(cells, height - z)
+        amounts = cells if counting else bit_counts(cells)
+        sums = add(running_sums(widen(amounts, total)), total)
+        store(row, bottom + z, add(load(row, bottom + z), sums))
+        total = last(sums)
+    for z in range(bottom + (height + LANES - 1) // LANES * LANES, row.shape[0] - LANES, LANES):
+        store(row, z, add(load(row, z), total))
 
 
 @rule
@@ -79,26 +86,34 @@ def box_sum(S, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
     return high - low
 
 
-@rule
-def set_corners(S, x0, x1, y0, y1, z0, z1, corner):  # type: ignore[no-untyped-def]
-    """Write where the corners of a box about an entry of the flat S lie, from that entry, to ``corner`` (8,).
+@bare_kernel
+def set_corners(S, boxes, corners):  # type: ignore[no-untyped-def]
+    """Write where the corners of ``boxes`` (B, 6) lie in the flat S, from the voxel that they are about, to (B, 8).
 
-    The box's sum is ((0 - 1) - (2 - 3)) - ((4 - 5) - (6 - 7)).
+    A box's sum is ((0 - 1) - (2 - 3)) - ((4 - 5) - (6 - 7)).
     """
     along_x, along_y = S.shape[1] * S.shape[2], S.shape[2]
-    x0, x1, y0, y1 = x0 * along_x, x1 * along_x, y0 * along_y, y1 * along_y
-    corner[0], corner[1] = x1 + y1 + z1, x1 + y1 + z0
-    corner[2], corner[3] = x0 + y1 + z1, x0 + y1 + z0
-    corner[4], corner[5] = x1 + y0 + z1, x1 + y0 + z0
-    corner[6], corner[7] = x0 + y0 + z1, x0 + y0 + z0
+    for b in range(boxes.shape[0]):
+        x0, x1 = boxes[b, 0] * along_x, boxes[b, 1] * along_x
+        y0, y1 = boxes[b, 2] * along_y, boxes[b, 3] * along_y
+        z0, z1 = boxes[b, 4], boxes[b, 5]
+        corners[b, 0], corners[b, 1] = x1 + y1 + z1, x1 + y1 + z0
+        corners[b, 2], corners[b, 3] = x0 + y1 + z1, x0 + y1 + z0
+        corners[b, 4], corners[b, 5] = x1 + y0 + z1, x1 + y0 + z0
+        corners[b, 6], corners[b, 7] = x0 + y0 + z1, x0 + y0 + z0
 
 
-def integral_volume(cells: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
-    """Return the integral volume (nx+1, ny+1, nz+1) uint32 of a parts grid (uint8) or a count grid (uint32)."""
-    S = np.empty([n + 1 for n in cells.shape], dtype=np.uint32)
-    box = np.array([0, 0, 0, *(n - 1 for n in cells.shape)], dtype=np.int64)
-    integrate(cells, box, cells.dtype != np.uint8, S)
-    return S
+def integral_volume(cells: npt.NDArray[Any], narrow: bool = False) -> Integral:
+    """Return the integral volume (nx+1, ny+1, nz+1) of a parts grid (uint8) or a count grid (uint32).
+
+    It is uint32, or uint16 if ``narrow``, which is for parts grids only.
+    """
+    nx, ny, nz = cells.shape
+    S: npt.NDArray[Any] = np.empty((nx + 1, ny + 1, _rounded_up(nz + 1)), np.uint16 if narrow else np.uint32)
+    box = np.array([0, 0, 0, nx - 1, ny - 1, nz - 1], dtype=np.int64)
+    memory = np.zeros(LANES, cells.dtype), np.zeros(S.shape[2] + LANES, S.dtype)
+    integrate(cells, box, np.zeros(3, np.int64), cells.dtype != np.uint8, 0, ny + 1, *memory, S)
+    return np.ascontiguousarray(S[:, :, : nz + 1])
 
 
 @kernel
@@ -120,3 +135,29 @@ def box_reach(boxes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
     """Return the box that holds all of ``boxes`` (B, 6) and the voxel that they are about."""
     low, high = boxes[:, 0::2].min(axis=0, initial=0), boxes[:, 1::2].max(axis=0, initial=1)
     return np.stack([low, high], axis=1).reshape(-1).astype(np.int64)
+
+
+def _rounded_up(height: int) -> int:
+    """Return the least whole number of vectors that holds ``height`` voxels."""
+    return -(-height // LANES) * LANES
+
+
+def shape_with_margins(shape: tuple[int, ...], reach: npt.NDArray[np.int64]) -> tuple[int, int, int]:
+    """Return the shape of an integral volume in which boxes that ``reach`` so far about ``shape`` voxels lie.
+
+    The voxels begin at -reach[0], -reach[2], -reach[4]. A column is as high as whole vectors of voxels ask for.
+    """
+    x0, x1, y0, y1, z0, z1 = reach.tolist()
+    return shape[0] + x1 - x0, shape[1] + y1 - y0, _rounded_up(_rounded_up(shape[2]) + z1 - z0)
+
+
+def with_margins(S: Integral, reach: npt.NDArray[np.int64]) -> Integral:
+    """Return a copy of ``S`` that goes on over empty cells, so that boxes about its voxels may ``reach`` so far."""
+    low, shape = -reach[0::2], shape_with_margins(tuple(n - 1 for n in S.shape), reach)
+    longer: npt.NDArray[Any] = np.pad(
+        S, [(a, n - m - a) for a, n, m in zip(low, shape, S.shape, strict=True)], mode="edge"
+    )
+    longer[: low[0]] = 0
+    longer[:, : low[1]] = 0
+    longer[:, :, : low[2]] = 0
+    return longer

@@ -16,14 +16,15 @@ from headvox.data import F64, Cloud, DepthImage, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import GateTables, candidate_reach, gate_columns, padded
-from headvox.integral import box_reach, integrate
+from headvox.gate import candidate_reach, gate_columns, gate_tables
+from headvox.integral import box_reach, integrate, set_corners, shape_with_margins
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
 from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
+from headvox.simd import LANES
 from headvox.suppress import local_maxima, suppress_overlaps
 from headvox.visibility import camera_table, cells_of, count_states, look_about
-from headvox.vote import DROPPED, StageTables, seen_boxes, set_box_corners, vote_masks, vote_stages
+from headvox.vote import DROPPED, StageTables, seen_boxes, vote_masks, vote_stages
 from headvox.voxelize import (
     Lattice,
     Rays,
@@ -94,11 +95,12 @@ class Detector:
         clock = _Clock(self.stage_ms)
         memory = self._memory_for(frame)
         memory.clear()
-        box = self._voxelize(frame, memory)
+        occupied = self._voxelize(frame, memory)
         clock.done("voxelize")
-        S = self._integrate(memory, box)
+        candidates = memory.candidates_about(occupied)
+        S = self._integrate(memory, occupied, candidates)
         clock.done("integral")
-        survivors = self._gate(S, box, memory)
+        survivors = self._gate(S, candidates, memory)
         clock.done("gate")
         scores = self._vote(S, survivors, memory)
         clock.done("vote")
@@ -117,7 +119,7 @@ class Detector:
     # -------------------------------------------------------------------------------------------------- the stages
 
     def _voxelize(self, frame: Frame, memory: _Memory) -> I64:
-        """Enter every reading into the grid; return the box of cells that may pass the gate."""
+        """Enter every reading into the grid; return its lowest and highest occupied cell."""
         lattice, parts = memory.lattice, self._threads.count
         limits, shape, shift = memory.limits, lattice.shape, lattice.subdivision - 1
         counting = self.cascade.source.counting
@@ -158,35 +160,48 @@ class Detector:
         span = np.array([min(span[0] for span in spans), max(span[1] for span in spans)])
         occupied_box(memory.cells[0], span, box)
         memory.dirty = (int(box[0]), int(box[3]) + 1)
-        box += memory.reach
-        box[:3] = np.maximum(box[:3], 0)
-        box[3:] = np.minimum(box[3:], np.array(shape) - 1)
         return box
 
-    def _integrate(self, memory: _Memory, box: I64) -> npt.NDArray[Any]:
-        """Return the integral volume of ``box``, with empty cells below and above for the boxes of the gate."""
-        nx, ny, nz = (int(n) for n in box[3:] - box[:3] + 1)
-        shape = (nx + 1, ny + 1, memory.below + padded(nz) + memory.above + 1)
+    def _integrate(self, memory: _Memory, occupied: I64, candidates: I64) -> npt.NDArray[Any]:
+        """Return the integral volume about the box ``candidates``, with margins for whatever box is looked up there."""
+        shape = shape_with_margins(tuple((candidates[3:] - candidates[:3] + 1).tolist()), memory.reach)
         S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
-        memory.longer[:] = box
-        memory.longer[2] -= memory.below
-        integrate(memory.cells[0], memory.longer, self.cascade.source.counting, S)
+        memory.first = candidates[:3] + memory.reach[0::2]
+        parts = self._threads.count
+
+        def add_up(part: int) -> None:
+            low, high = _share(shape[1], part, parts)
+            integrate(
+                memory.cells[0], occupied, memory.first, self.cascade.source.counting, low, high,
+                memory.spare[part], memory.row[part][: shape[2] + LANES], S,
+            )  # fmt: skip
+
+        self._threads.run(add_up, [(part,) for part in range(parts)])
         return S
 
-    def _gate(self, S: npt.NDArray[Any], box: I64, memory: _Memory) -> I32:
-        parts, slices, height = self._threads.count, S.shape[0] - 1, int(box[5] - box[2] + 1)
+    def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: _Memory) -> I32:
+        parts = self._threads.count
+        low, high = candidates[:3] - memory.first, candidates[3:] - memory.first + 1
+        region = np.array([low[1], high[1], low[2], high[2]])
+        odd = memory.lattice.odd + int(memory.first.sum())
+        set_corners(S, self.cascade.gate.boxes, memory.gate_corners)
         found = [0] * parts
 
         def sweep(part: int) -> None:
-            low, high = _share(slices, part, parts)
-            gate, below = memory.gates[part], memory.below
-            odd = memory.lattice.odd + int(memory.longer[:3].sum())
-            arguments = (S, low, high, below, below + height, *gate.tables, gate.every_other, odd)
-            arguments += (gate.corners,)
-            found[part] = gate_columns(*arguments, memory.survivors[part])
+            begin, end = _share(int(high[0] - low[0]), part, parts)
+            arguments = (
+                S,
+                region,
+                low[0] + begin,
+                low[0] + end,
+                *memory.gate,
+                self.cascade.gate.every_other,
+                odd,
+            )
+            found[part] = gate_columns(*arguments, memory.gate_corners, memory.survivors[part])
             if found[part] > len(memory.survivors[part]):
                 memory.survivors[part] = np.empty((2 * found[part], 3), np.int32)
-                gate_columns(*arguments, memory.survivors[part])
+                gate_columns(*arguments, memory.gate_corners, memory.survivors[part])
 
         self._threads.run(sweep, [(part,) for part in range(parts)])
         lists = [survivors[:count] for survivors, count in zip(memory.survivors, found, strict=True)]
@@ -198,7 +213,7 @@ class Detector:
         scores, parts = memory.scores[: len(survivors)], self._threads.count
         votes, stages = self.cascade.votes, self.cascade.stages
         if stages is not None:
-            set_box_corners(S, stages.boxes, memory.corners)
+            set_corners(S, stages.boxes, memory.corners)
 
         def score(part: int) -> None:
             low, high = _share(len(survivors), part, parts)
@@ -233,7 +248,7 @@ class Detector:
         if sees and stages is not None and len(peaks):
             cells = survivors[peaks]
             states = np.zeros((len(cells), len(memory.offsets)), np.uint8)
-            in_lattice = cells + memory.longer[:3].astype(np.int32)
+            in_lattice = cells + memory.first.astype(np.int32)
             for image in frame.depths:
                 look_about(
                     image.depth, camera_table(image, memory.lattice), in_lattice, memory.offsets, states
@@ -264,7 +279,7 @@ class Detector:
         count = len(cells)
         if count == 0:
             return Heads()
-        cells = cells + memory.longer[:3].astype(np.int32)
+        cells = cells + memory.first.astype(np.int32)
         centres = memory.lattice.centres(cells)
         radii = np.full(count, 0.1)
         if self.config.refine == "sphere":
@@ -333,32 +348,32 @@ class _Memory:
         self.dirty: tuple[int, int] | None = (0, 0)
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
-        nx, ny, nz = lattice.shape
-        boxes = cascade.gate.boxes
-        if cascade.stages is not None:  # so that a stage, too, looks no box up beyond the ends of a column
-            boxes = np.concatenate([boxes, cascade.stages.boxes])
-        below, above = box_reach(boxes)[4:].tolist()
-        self.below, self.above = -below, above
-        length = self.below + padded(nz) + self.above + 1
-        self.S = np.empty((nx + 1) * (ny + 1) * length, sum_type)
-        self.index = np.zeros(nx * ny * length, np.int32)
-        self.longer = np.zeros(6, np.int64)
-        self.gates = [GateTables.of(cascade.gate, self.S.dtype) for _ in range(threads)]
-        self.reach = candidate_reach(cascade.gate)
+        tables = [cascade.gate.boxes, *([cascade.stages.boxes] if cascade.stages is not None else [])]
+        self.reach = box_reach(np.concatenate(tables))
+        shape = shape_with_margins(lattice.shape, self.reach)
+        self.S = np.empty(math.prod(shape), sum_type)
+        self.spare = [np.zeros(LANES, cell_type) for _ in range(threads)]
+        self.row = [np.zeros(shape[2] + LANES, sum_type) for _ in range(threads)]
+        self.index = np.zeros(math.prod(shape), np.int32)
+        self.first = np.zeros(3, np.int64)
+        """The cell that the integral volume begins at."""
+        self.gate = gate_tables(cascade.gate, self.S.dtype)
+        self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.uint64)
+        self.candidate_reach = candidate_reach(cascade.gate)
         self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
         self.points = np.empty((MOST_PARTS, 3))
         self.seen = np.zeros((1, 1, 2), np.int32)
         self.offsets, self.offset_start = np.empty((0, 3), np.int32), np.zeros(1, np.int32)
         self.tables: tuple[Any, ...] = ()
-        self.corners = np.empty((0, 8), np.int64)
+        self.corners = np.empty((0, 8), np.uint64)
         self.stages: list[tuple[Any, ...]] = [()] * threads
         self.sees = cascade.source.sees
         if cascade.stages is not None:
             boxes, _ = seen_boxes(cascade.stages)
             self.offsets, self.offset_start = cells_of(boxes)
-            self.corners = np.empty((len(cascade.stages.boxes), 8), np.int64)
-            tables = StageTables.of(cascade.stages, self.S.dtype)
-            self.tables, self.stages = tables.tables, [tables.memory() for _ in range(threads)]
+            self.corners = np.empty((len(cascade.stages.boxes), 8), np.uint64)
+            stages = StageTables.of(cascade.stages, self.S.dtype)
+            self.tables, self.stages = stages.tables, [stages.memory() for _ in range(threads)]
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 
@@ -370,6 +385,11 @@ class _Memory:
         else:
             self.cells[0][self.dirty[0] : self.dirty[1]] = 0
         self.dirty = None
+
+    def candidates_about(self, occupied: I64) -> I64:
+        """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""
+        box = occupied + self.candidate_reach
+        return np.concatenate([np.maximum(box[:3], 0), np.minimum(box[3:], np.array(self.lattice.shape) - 1)])
 
     def place(self, lattice: Lattice) -> None:
         """Stand for another region of the same shape."""

@@ -12,6 +12,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import extending, types
+from numba.core import cgutils
 from numba.extending import models, register_model
 
 LANES = 32
@@ -110,6 +111,72 @@ def choose(typingctx, x, cut, at_most, above):  # type: ignore[no-untyped-def]
         return builder.select(builder.icmp_signed("<=", lanes, _spread(builder, number)), yes, no)
 
     return (x(x, x.scalar, x, x), emit) if x == at_most == above else None
+
+
+@intrinsic
+def beginning(typingctx, a, count):  # type: ignore[no-untyped-def]
+    """Return ``a`` with 0 in all but the first ``count`` lanes; fewer than 0 or more than all are none or all."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        x, number = arguments
+        lane = ir.Constant(_vector(64), list(range(LANES)))
+        keep = builder.icmp_signed("<", lane, _spread(builder, number))
+        return builder.select(keep, x, ir.Constant(x.type, None))
+
+    return a(a, types.int64), emit
+
+
+@intrinsic
+def bit_counts(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return how many bits are set, lane by lane."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        (x,) = arguments
+        name = f"llvm.ctpop.v{LANES}i{x.type.element.width}"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(x.type, [x.type]), name)
+        return builder.call(function, [x])
+
+    return a(a), emit
+
+
+@intrinsic
+def widen(typingctx, a, like):  # type: ignore[no-untyped-def]
+    """Return unsigned ``a`` as lanes of the type of ``like``, which is as wide or wider."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        x, y = arguments
+        return x if x.type == y.type else builder.zext(x, y.type)
+
+    return like(a, like), emit
+
+
+@intrinsic
+def running_sums(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return in each lane the sum of ``a`` up to it."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        (total,) = arguments
+        zeros = ir.Constant(total.type, None)
+        step = 1
+        while step < LANES:  # every lane holds the sum of the last ``step`` ones
+            shift = [LANES - step + lane for lane in range(LANES)]
+            moved = builder.shuffle_vector(zeros, total, ir.Constant(_vector(32), shift))
+            total = builder.add(total, moved)
+            step *= 2
+        return total
+
+    return a(a), emit
+
+
+@intrinsic
+def last(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return the last lane of ``a`` in every lane."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        (x,) = arguments
+        return builder.shuffle_vector(x, x, ir.Constant(_vector(32), [LANES - 1] * LANES))
+
+    return a(a), emit
 
 
 @intrinsic

@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.integral import Integral, box_reach, box_sum, set_corners
+from headvox.integral import Integral, box_reach, box_sum, set_corners, with_margins
 from headvox.kernels import bare_kernel, kernel, rule
 from headvox.masks import SCORE_UNIT, STATISTICS, CompiledStages, CompiledVotes
 from headvox.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
 
 DROPPED = -(1 << 40)
-OUTSIDE = np.uint64(1 << 63)
 FEATURES_PER_GROUP = len(STATISTICS)
 
 I32 = npt.NDArray[np.int32]
@@ -97,24 +96,6 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
 
 
 @bare_kernel
-def set_box_corners(S, boxes, corners):  # type: ignore[no-untyped-def]
-    """Write where the corners of ``boxes`` lie in the flat S, from any voxel about which they lie within S."""
-    for b in range(boxes.shape[0]):
-        set_corners(
-            S, boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3], boxes[b, 4], boxes[b, 5], corners[b]
-        )
-
-
-@rule
-def _sum_at(flat, at, corners, b):  # type: ignore[no-untyped-def]
-    """Return the sum over a box that lies within the volume, in the low bits: eight look-ups and no more."""
-    high = np.int64(flat[at + corners[b, 0]]) - np.int64(flat[at + corners[b, 1]])
-    high -= np.int64(flat[at + corners[b, 2]]) - np.int64(flat[at + corners[b, 3]])
-    low = np.int64(flat[at + corners[b, 4]]) - np.int64(flat[at + corners[b, 5]])
-    return high - (low - (np.int64(flat[at + corners[b, 6]]) - np.int64(flat[at + corners[b, 7]])))
-
-
-@bare_kernel
 def _rank(sums, count):  # type: ignore[no-untyped-def]
     """Bring the three smallest of ``count`` rows to the first rows and the three largest to the last, lane by lane."""
     for i in range(min(3, count - 1)):
@@ -170,38 +151,26 @@ def _add_trees(first, last, leaf_start, leaves, node_start, nodes, cuts, feature
 
 
 @bare_kernel
-def _locate(S, cells, alive, begin, width, reach, at):  # type: ignore[no-untyped-def]
-    """Write where the candidates lie in the flat S to ``at``; OUTSIDE where a box about them leaves S."""
-    nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
-    for lane in range(width):
-        i = alive[begin + lane]
-        x, y, z = np.int64(cells[i, 0]), np.int64(cells[i, 1]), np.int64(cells[i, 2])
-        inside = (
-            x + reach[0] >= 0 and x + reach[1] <= nx and y + reach[2] >= 0 and y + reach[3] <= ny
-            and z + reach[4] >= 0 and z + reach[5] <= nz
-        )  # fmt: skip
-        at[lane] = (x * S.shape[1] + y) * S.shape[2] + z if inside else OUTSIDE
-
-
-@bare_kernel
-def _look_up(S, cells, alive, begin, width, at, boxes, corners, first, count, sums):  # type: ignore[no-untyped-def]
+def _look_up(flat, at, width, corners, first, count, sums):  # type: ignore[no-untyped-def]
     """Write the sums over ``count`` boxes from ``first`` on to as many rows of ``sums``, a lane a candidate."""
-    flat = S.reshape(-1)
-    mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
+    mask = 0xFFFF if flat.itemsize == 2 else 0xFFFFFFFF
     # Unsigned, because a signed index costs a check for counting from the end.
     for k in range(np.uint64(count)):
         row, b = k * np.uint64(LANES), np.uint64(first) + k
+        c0, c1, c2, c3 = corners[b, 0], corners[b, 1], corners[b, 2], corners[b, 3]
+        c4, c5, c6, c7 = corners[b, 4], corners[b, 5], corners[b, 6], corners[b, 7]
         for lane in range(np.uint64(width)):
-            if at[lane] != OUTSIDE:
-                sums[row + lane] = _sum_at(flat, at[lane], corners, b) & mask
-            else:
-                i = alive[np.uint64(begin) + lane]
-                sums[row + lane] = sum_about(S, cells[i, 0], cells[i, 1], cells[i, 2], boxes[b])
+            voxel = at[lane]
+            high = np.int64(flat[voxel + c0]) - np.int64(flat[voxel + c1])
+            high -= np.int64(flat[voxel + c2]) - np.int64(flat[voxel + c3])
+            low = np.int64(flat[voxel + c4]) - np.int64(flat[voxel + c5])
+            low -= np.int64(flat[voxel + c6]) - np.int64(flat[voxel + c7])
+            sums[row + lane] = (high - low) & mask
 
 
 @bare_kernel
 def vote_stages(  # type: ignore[no-untyped-def]
-    S, cells, seen, first, last, to_stage, boxes, reach, group_start, group_channel, seen_start, used_start, used,
+    S, cells, seen, first, last, to_stage, group_start, group_channel, seen_start, used_start, used,
     leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, sums, features, values,
     total, scores,
 ):  # fmt: skip
@@ -209,10 +178,10 @@ def vote_stages(  # type: ignore[no-untyped-def]
 
     Each stage takes the candidates that are left, LANES at a time: it looks up the groups its trees ask for, and adds
     its trees up. ``seen`` (candidates, boxes of other channels, 2) holds how many cells of a box are known-empty and
-    hidden. ``corners`` is from :func:`set_box_corners`; ``alive`` (candidates,), ``at`` (LANES,) and the rows of LANES
-    numbers ``sums``, ``features``, ``values`` and ``total`` are working memory.
+    hidden. No box may leave S; ``corners`` are those of the boxes. ``alive`` (candidates,), ``at`` (LANES,) and the
+    rows of LANES numbers ``sums``, ``features``, ``values`` and ``total`` are working memory.
     """
-    end = last
+    flat, end = S.reshape(-1), last
     for i in range(first, last):
         scores[i] = 0
         alive[i] = i
@@ -220,7 +189,9 @@ def vote_stages(  # type: ignore[no-untyped-def]
         kept = first
         for begin in range(first, end, LANES):
             width = min(LANES, end - begin)
-            _locate(S, cells, alive, begin, width, reach, at)
+            for lane in range(width):
+                i = alive[begin + lane]
+                at[lane] = (cells[i, 0] * S.shape[1] + cells[i, 1]) * S.shape[2] + cells[i, 2]
             for u in range(used_start[s], used_start[s + 1]):
                 g, ranked = used[u, 0], used[u, 1]
                 count, channel = group_start[g + 1] - group_start[g], group_channel[g]
@@ -229,7 +200,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
                         for lane in range(width):
                             sums[LANES * k + lane] = seen[alive[begin + lane], seen_start[g] + k, channel - 1]
                 else:
-                    _look_up(S, cells, alive, begin, width, at, boxes, corners, group_start[g], count, sums)
+                    _look_up(flat, at, width, corners, group_start[g], count, sums)
                 _statistics(sums, count, ranked, features, FEATURES_PER_GROUP * LANES * g)
             _add_trees(
                 stage_trees[s], stage_trees[s + 1], leaf_start, leaves, node_start, nodes, cuts, features, values, total
@@ -290,11 +261,10 @@ class StageTables:
         narrow = sum_type.itemsize == 2 and greatest <= np.iinfo(np.int32).max
         number = np.dtype(np.int32 if narrow else np.int64)
         info = np.iinfo(np.int32 if narrow else np.int64)
-        looked_up = stages.boxes[np.repeat(stages.group_channel == 0, np.diff(stages.group_start))]
         _, seen_start = seen_boxes(stages)
         return cls(
             (
-                stages.boxes, box_reach(looked_up), stages.group_start, stages.group_channel, seen_start,
+                stages.group_start, stages.group_channel, seen_start,
                 np.cumsum([0, *map(len, used)]), np.concatenate(used),
                 leaf_start, leaves.astype(number), node_start, (LANES * table).astype(np.uint64),
                 np.clip(inner[:, 1], info.min, info.max).astype(number), stages.stage_trees, stages.stage_keep,
@@ -335,8 +305,10 @@ def score_by_stages(S: Integral, cells: I32, stages: CompiledStages, seen: I32 |
     to_stage = stages.occupied_stages if seen is None else len(stages.stage_keep)
     seen = np.zeros((len(cells), 1, 2), np.int32) if seen is None else seen
     tables = StageTables.of(stages, S.dtype)
-    corners = np.empty((len(stages.boxes), 8), np.int64)
-    set_box_corners(S, stages.boxes, corners)
+    reach = box_reach(stages.boxes)
+    S, cells = with_margins(S, reach), cells - reach[0::2].astype(np.int32)
+    corners = np.empty((len(stages.boxes), 8), np.uint64)
+    set_corners(S, stages.boxes, corners)
     scores, alive = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
     vote_stages(
         S, cells, seen, 0, len(cells), to_stage, *tables.tables, corners, alive, *tables.memory(), scores

@@ -8,10 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import headvox
 from headvox.cli import main
+from headvox.data import Frame
+from headvox.evaluate.found import FoundHeads
 from headvox.evaluate.heldout import tuned_frames, word
+from headvox.evaluate.loop import Mishap, _hold
+from headvox.evaluate.truth import TrueHeads
 
 SAMPLE = Path(headvox.__file__).parent / "assets" / "sample"
 CENTRES = {0: [[0.0, 0.0, 1.6], [1.0, 0.0, 1.6]], 1: [], 2: [[0.0, 0.0, 1.6]]}
@@ -63,6 +68,47 @@ def test_a_recording_is_scored(recording: Path, capsys: pytest.CaptureFixture[st
     assert scores["centre_mean_m"] < 0.05
     assert scores["curve"][-1][1] >= scores["recall"]
     assert sum(group["heads"] for group in scores["groups"]["posture"]) == 17
+    expected = {"report.json", "six.png"} | ({"six-default-false.png"} if scores["false"] else set())
+    expected |= {"six-default-misses.png"} if scores["found"] < 17 else set()
+    assert {path.name for path in out.iterdir()} == expected
+
+
+def test_the_worst_mistakes_are_drawn(
+    recording: Path, clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # With a radius of 1 mm everything is missed and false: six rows each of a depth image and two views.
+    assert main(["eval", str(recording), "--radius", "0.001", "-o", str(tmp_path / "depth")]) == 0
+    found = lines(tmp_path / "other.jsonl", {0: [[2, 0, 1]]})
+    assert main(["eval", str(clouds), "--heads", str(found), "-o", str(tmp_path / "cloud")]) == 0
+    sizes = {}
+    for path in tmp_path.glob("*/*.png"):
+        with Image.open(path) as image:
+            sizes[path.name] = image.size
+            assert len(np.unique(np.asarray(image.convert("L")))) > 50
+    assert set(sizes) == {
+        "six.png", "six-default-misses.png", "six-default-false.png",
+        "three.png", "three-other-misses.png", "three-other-false.png",
+    }  # fmt: skip
+    # Three people and three detections, at about the same place in all frames; two heads missed, one false.
+    rows = {name: height // 396 for name, (_, height) in sizes.items()}
+    assert rows["six-default-misses.png"] >= 3
+    assert (rows["three-other-misses.png"], rows["three-other-false.png"]) == (2, 1)
+
+
+def test_mistakes_at_one_place_are_told_once() -> None:
+    def mishap(badness: float, number: int, x: float) -> Mishap:
+        place = np.array([x, 0.0, 0.0])
+        nobody = TrueHeads.of(0, [])
+        return Mishap(badness, -number, "", 1, Frame(0), place, FoundHeads.none(), nobody, nobody.ignored)
+
+    for moving, expected in (
+        (True, [(5.0, 2, 2), (3.0, 1, 1)]),
+        (False, [(5.0, 2, 1), (4.0, 0, 1), (3.0, 1, 1)]),
+    ):
+        worst: list[Mishap] = []
+        for one in (mishap(4.0, 0, 0.0), mishap(3.0, 1, 2.0), mishap(5.0, 2, 0.1)):
+            _hold(worst, moving, one)
+        assert [(m.badness, m.number, m.times) for m in worst] == expected
 
 
 def test_what_headvox_run_wrote_scores_as_the_detector_does(

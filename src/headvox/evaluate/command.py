@@ -92,17 +92,17 @@ def _evaluate(args: argparse.Namespace) -> int:
     configs += [replace(configs[0], cascade=name) for name in args.against]
     live = Live(sys.stderr, None)
     scores: list[Scores] = []
-    runs: list[tuple[Scores, Run]] = []
+    runs: list[tuple[Scenario, Scores, Run]] = []
     try:
         for scenario in _scenarios(args, live):
             for done in _run(scenario, configs, args, scenario.rules or rules, live):
                 scores += done[0]
-                runs.append((done[0][0], done[1]))
+                runs.append((scenario, done[0][0], done[1]))
     finally:
         live.close()
     report = Report(tuple(scores), _made(configs, rules, args))
     if args.output is not None:
-        _write(report, runs, args.output)
+        _write(report, runs, rules, args.output)
     print(json.dumps(_plain(report), indent=1, allow_nan=False) if args.json else _text(report, args.details))
     missed = [line for limit in args.limit for line in limit.missed(report)]
     for line in missed:
@@ -235,9 +235,24 @@ def _text(report: Report, details: bool) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _write(report: Report, runs: Sequence[tuple[Scores, Run]], folder: Path) -> None:
+def _write(report: Report, runs: Sequence[tuple[Scenario, Scores, Run]], rules: Rules, folder: Path) -> None:
+    """Write report.json, and then pictures: of each scenario, and of what went wrong there."""
+    from headvox.evaluate.pictures import picture_mishaps
+    from headvox.evaluate.plots import need_matplotlib, plot_scenario
+    from headvox.plot_masks import file_name
+
     folder.mkdir(parents=True, exist_ok=True)
     report.save(folder / "report.json")
+    need_matplotlib()
+    for name in dict.fromkeys(scenario.name for scenario, _, _ in runs):
+        those = [(scores, run) for scenario, scores, run in runs if scenario.name == name]
+        own = next(scenario.rules for scenario, _, _ in runs if scenario.name == name)
+        plot_scenario(those, own or rules, folder / f"{file_name(name)}.png")
+        for scores, run in those:
+            for kind, mishaps in (("misses", run.misses), ("false", run.false)):
+                if mishaps:
+                    stem = file_name(f"{name} {scores.detector} {kind}")
+                    picture_mishaps(f"{scores.name}: worst {kind}", mishaps, folder / f"{stem}.png")
 
 
 # -------------------------------------------------------------------------------------------------- flags

@@ -16,12 +16,14 @@ from headvox.evaluate.found import FoundHeads
 from headvox.evaluate.match import Rules, match
 from headvox.evaluate.metrics import Sample, counted
 from headvox.evaluate.scenarios import Scenario
-from headvox.evaluate.truth import NO_ID, TrueHeads
+from headvox.evaluate.truth import NO_ID, Bools, TrueHeads
 from headvox.pipeline import Detector
 from headvox.warmup import warm_up
 
 LOWEST_SCORE = -100.0
 MOST_WORST = 6
+MOST_HELD = 24
+SAME_PLACE_M = 0.3
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -29,11 +31,22 @@ class Mishap:
     """A head that was missed, or a detection that is none; the greater ``badness``, the more it is to be looked at."""
 
     badness: float
-    number: int
+    earlier: int
+    """Minus the number of the frame: of equally bad ones the first is kept."""
+    words: str = field(compare=False)
+    times: int = field(compare=False)
+    """In how many frames it happened at this place, at least; where frames follow on each other."""
     frame: Frame = field(compare=False)
     place: F64 = field(compare=False)
     found: FoundHeads = field(compare=False)
     true: TrueHeads = field(compare=False)
+    counted: Bools = field(compare=False)
+    """Which of the true heads had to be found."""
+
+    @property
+    def number(self) -> int:
+        """The number of the frame, from 0."""
+        return -self.earlier
 
 
 @dataclass(slots=True)
@@ -104,7 +117,7 @@ def _go_over(
     rules: Rules,
     on_frame: Callable[[int], None],
 ) -> None:
-    for number, (frame, true) in enumerate(scenario.frames(), start=1):
+    for number, (frame, true) in enumerate(scenario.frames()):
         if isinstance(frame, BadFrame):
             outcome.bad += 1
             outcome.samples.append(Sample(frame.stamp_ns, FoundHeads.none(), true, np.empty((0, 3))))
@@ -118,24 +131,38 @@ def _go_over(
         sensors += [cloud.T_world_sensor[:3, 3] for cloud in frame.clouds if cloud.T_world_sensor is not None]
         outcome.samples.append(Sample(frame.stamp_ns, found, true, np.array(sensors).reshape(-1, 3), swept))
         if true is not None:
-            _keep_worst(outcome, number, frame, found, true, rules)
-        on_frame(number)
+            _keep_worst(outcome, scenario.moving, number, frame, found, true, rules)
+        on_frame(number + 1)
+    del outcome.misses[MOST_WORST:], outcome.false[MOST_WORST:]
 
 
 def _keep_worst(
-    outcome: Run, number: int, frame: Frame, found: FoundHeads, true: TrueHeads, rules: Rules
+    outcome: Run, moving: bool, number: int, frame: Frame, found: FoundHeads, true: TrueHeads, rules: Rules
 ) -> None:
     """Keep the most visible heads that were missed, and the false ones with the best scores."""
-    pairing = match(found.centres, true.centres, counted(true, rules), rules)
+    kept = counted(true, rules)
+    pairing = match(found.centres, true.centres, kept, rules)
     for j in pairing.missed:
-        seen = 1.0 if np.isnan(true.visible[j]) else float(true.visible[j])
-        _insert(outcome.misses, Mishap(seen, -number, frame, true.centres[j], found, true))
+        is_told = not np.isnan(true.visible[j])
+        seen = float(true.visible[j]) if is_told else 1.0
+        words = f"missed, {seen:.0%} visible" if is_told else "missed"
+        miss = Mishap(seen, -number, words, 1, frame, true.centres[j], found, true, kept)
+        _hold(outcome.misses, moving, miss)
     for i in pairing.false:
         score = 0.0 if np.isnan(found.scores[i]) else float(found.scores[i])
-        _insert(outcome.false, Mishap(score, -number, frame, found.centres[i], found, true))
+        _hold(
+            outcome.false,
+            moving,
+            Mishap(score, -number, "no head", 1, frame, found.centres[i], found, true, kept),
+        )
 
 
-def _insert(worst: list[Mishap], mishap: Mishap) -> None:
+def _hold(worst: list[Mishap], moving: bool, mishap: Mishap) -> None:
+    """Hold the mishap if it is one of the worst; of those at one place, where frames follow on, the worst only."""
+    here = [m for m in worst if moving and np.linalg.norm(m.place - mishap.place) < SAME_PLACE_M]
+    if here:
+        worst.remove(here[0])
+        mishap = replace(max(here[0], mishap), times=here[0].times + 1)
     worst.append(mishap)
     worst.sort(reverse=True)
-    del worst[MOST_WORST:]
+    del worst[MOST_HELD:]

@@ -13,9 +13,7 @@ from scipy.spatial.transform import Rotation
 from headvox.data import F64
 from headvox.evaluate.found import FoundHeads
 from headvox.evaluate.match import Match, Rules, match
-from headvox.evaluate.truth import LABELS, TrueHeads
-
-Bools = npt.NDArray[np.bool_]
+from headvox.evaluate.truth import LABELS, Bools, TrueHeads
 
 FLIP_DEG = 90.0
 DISTANCES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)

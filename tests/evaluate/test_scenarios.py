@@ -25,6 +25,7 @@ from headvox.evaluate.scenarios import (
 from headvox.evaluate.truth import TrueHeads, read_truth
 from headvox.frames import unproject
 from headvox.synth.heads import ply_bytes
+from headvox.synth.wear import HAIR_STYLES, HATS
 
 
 def all_of(scenario: Scenario) -> list[tuple[Frame, TrueHeads]]:
@@ -86,6 +87,7 @@ def test_two_cameras_and_keeping_their_frames(tmp_path: Path) -> None:
         assert heads.quaternions == pytest.approx(read.quaternions)
         assert (heads.shares, heads.labels) == (read.shares, read.labels)
         assert heads.labels["posture"][0] == "walking"
+        assert heads.labels["hair"][0] in (*HAIR_STYLES, *HATS)
         assert (heads.visible >= 0.15).any()
     assert len(read_truth(tmp_path / "kept" / "heads.jsonl")) == 2
     with pytest.raises(HeadvoxError, match="holds something"):

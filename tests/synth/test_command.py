@@ -204,6 +204,7 @@ def test_the_sample_in_the_package_is_what_synth_makes():
         for row, head in zip(json.loads(lines[k])["heads"], heads, strict=True):
             np.testing.assert_allclose(row["centre"], head.centre, atol=1e-5)
             assert row["visible"] == head.visible
+            assert (row["posture"], row["hair"]) == (head.posture, head.hair)
 
 
 def test_the_sample_is_small_and_everybody_is_seen():

@@ -38,13 +38,6 @@ class FoundHeads:
         """Return no heads."""
         return FoundHeads(np.empty((0, 3)), np.empty((0, 4)), np.empty(0), np.empty(0, np.int64), latency_ms)
 
-    def at_least(self, score: float) -> FoundHeads:
-        """Return the heads that score at least ``score``."""
-        kept = self.scores >= score
-        return FoundHeads(
-            self.centres[kept], self.quaternions[kept], self.scores[kept], self.ids[kept], self.latency_ms
-        )
-
 
 def read_found(path: Path) -> dict[int, FoundHeads]:
     """Return the heads of every line by its stamp: lines as ``headvox run --json`` prints them.

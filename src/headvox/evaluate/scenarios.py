@@ -136,6 +136,7 @@ def _row(head: TrueHead, ids_from: int) -> dict[str, object]:
         "truncated": head.truncated,
         "visible": head.visible,
         "posture": head.posture,
+        "hair": head.hair,
     }
 
 

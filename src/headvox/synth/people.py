@@ -65,7 +65,8 @@ class PosedBody:
 
     ``vertices`` (V, 3) metres, ``faces`` (F, 3), ``materials`` (F,): SKIN, HAIR, CLOTH, HAT or GLASSES.
     ``T_world_head`` (4, 4): x out of the face, y to the person's left, z through the crown, origin at the
-    centre of the bald head's box. ``hair_albedo`` runs from 0 (black) to 1 (white).
+    centre of the bald head's box. ``hair_albedo`` runs from 0 (black) to 1 (white). ``hair`` names what is on the head:
+    a hat, or else the style of the hair.
     """
 
     vertices: F64
@@ -74,6 +75,7 @@ class PosedBody:
     T_world_head: F64
     posture: str
     hair_albedo: float
+    hair: str = ""
 
 
 def sample_person(rng: np.random.Generator, child_share: float = 0.15) -> Person:
@@ -159,4 +161,5 @@ def pose_person(
         T_world_head=np.round(T_world_head, 12),
         posture=pose.posture,
         hair_albedo=person.wear.hair_albedo,
+        hair=person.wear.hair if person.wear.hat == "none" else person.wear.hat,
     )

@@ -203,6 +203,7 @@ def _row(head: TrueHead) -> dict[str, Any]:
         "truncated": head.truncated,
         "visible": head.visible,
         "posture": head.posture,
+        "hair": head.hair,
     }
 
 

@@ -43,7 +43,7 @@ class TrueHead:
     ``centre`` (3,) metres and ``quaternion`` (4,) x y z w, both world from head. ``visible`` says for each
     sensor which share (0..1) of the rays that would hit the head alone come back from it: not hidden, not cut
     off by the border, not lost by the sensor. ``truncated``: cut by the border where it is seen best.
-    ``ignore``: hardly seen by any sensor, or nobody's head.
+    ``ignore``: hardly seen by any sensor, or nobody's head. ``hair``: a hat, or else the style of the hair.
     """
 
     id: int
@@ -53,6 +53,7 @@ class TrueHead:
     visible: dict[str, float]
     ignore: bool
     truncated: bool
+    hair: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,7 @@ class _Thing:
     head: Mesh
     T_world_head: F64
     posture: str
+    hair: str
     ignore: bool
 
 
@@ -137,7 +139,14 @@ class Scene:
         ]
         gloss = GLOSS[body.materials]
         return _thing(
-            actor.id, body.vertices, body.faces, albedo, gloss, body.T_world_head, body.posture, False
+            actor.id,
+            body.vertices,
+            body.faces,
+            albedo,
+            gloss,
+            body.T_world_head,
+            (body.posture, body.hair),
+            False,
         )
 
 
@@ -147,7 +156,9 @@ def _dummy(dummy: Dummy, number: int) -> _Thing:
     T_world_head[:3, 3] = dummy.centre
     thing = dummy.item
     gloss = np.zeros(len(thing.faces), np.float32)
-    return _thing(number, thing.vertices, thing.faces, thing.albedo, gloss, T_world_head, "mannequin", True)
+    return _thing(
+        number, thing.vertices, thing.faces, thing.albedo, gloss, T_world_head, ("mannequin", ""), True
+    )
 
 
 def _thing(
@@ -157,7 +168,7 @@ def _thing(
     albedo: F32,
     gloss: F32,
     T_world_head: F64,
-    posture: str,
+    labels: tuple[str, str],
     ignore: bool,
 ) -> _Thing:
     middle = transform(inverse(T_world_head), vertices)[faces].mean(axis=1)
@@ -165,7 +176,7 @@ def _thing(
     ids = np.where(is_head, 2 * number, 2 * number + 1).astype(np.int32)
     mesh = Mesh(vertices, faces, albedo, ids, gloss)
     head = Mesh(vertices, faces[is_head], albedo[is_head], ids[is_head], gloss[is_head])
-    return _Thing(number, mesh, head, T_world_head, posture, ignore)
+    return _Thing(number, mesh, head, T_world_head, *labels, ignore)
 
 
 def _seen_by_camera(thing: _Thing, camera: Camera, view: View, depth: U16) -> tuple[float, bool]:
@@ -222,6 +233,7 @@ def _truth(thing: _Thing, names: list[str], seen: list[tuple[float, bool]]) -> T
         visible={name: round(share, 4) for name, (share, _) in zip(names, seen, strict=True)},
         ignore=thing.ignore or seen[best][0] < LEAST_VISIBLE,
         truncated=seen[best][1],
+        hair=thing.hair,
     )
 
 

@@ -8,19 +8,29 @@ from headvox.simd import (
     LANES,
     add,
     beginning,
+    below,
+    bit_and,
     bit_counts,
     choose,
+    equal,
     fill,
     larger,
     last,
     less,
     load,
+    load_triples,
     lowest,
+    mul,
     running_sums,
+    shift_right,
+    shifted,
     smaller,
     store,
     sub,
     times,
+    to_float,
+    to_int,
+    where,
     widen,
     within,
 )
@@ -50,6 +60,33 @@ def in_rows(a, at, count, out, wide):
     store(flat, 2 * LANES, beginning(x, count))
     store(flat, 3 * LANES, bit_counts(x))
     store(wide, 0, widen(x, load(wide, 0)))
+
+
+@bare_kernel
+def integers(a, b, at, out):
+    """As :func:`arithmetic`, for what only integers have."""
+    x, y, flat = load(a, at), load(b, at), out.reshape(-1)
+    store(flat, 0, mul(x, y))
+    store(flat, LANES, bit_and(x, y))
+    store(flat, 2 * LANES, shift_right(x, 3))
+    store(flat, 3 * LANES, shifted(x, y))
+    store(flat, 4 * LANES, where(below(x, y), x, y))
+    store(flat, 5 * LANES, where(equal(x, y), x, fill(b[at])))
+
+
+@bare_kernel
+def reals(xyz, out, cut):
+    x, y, z = load_triples(xyz, 1)
+    flat = out.reshape(-1)
+    store(flat, 0, add(x, mul(y, z)))
+    store(flat, LANES, sub(x, y))
+    store(cut, 0, to_int(z))
+    return below(x, y)
+
+
+@bare_kernel
+def converted(a, out):
+    store(out, 0, to_float(load(a, 0)))
 
 
 @bare_kernel
@@ -83,6 +120,45 @@ def test_equals_numpy(dtype, at):
     wanted = (p >= low) & (p <= high)
     assert [bool(bits >> lane & 1) for lane in range(LANES)] == wanted.tolist()
     assert 0 < wanted.sum() < LANES
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32])
+def test_integers_equal_numpy(dtype):
+    rng = np.random.default_rng(1)
+    info = np.iinfo(dtype)
+    a, b = rng.integers(info.min, info.max, (2, 40), dtype, endpoint=True)
+    b[::3] = a[::3]
+    out = np.zeros((6, LANES), dtype)
+    integers(a, b, 2, out)
+    x, y = a[2 : 2 + LANES], b[2 : 2 + LANES]
+    rows = [
+        x * y,
+        x & y,
+        x >> 3,
+        np.concatenate([x[-1:], y[:-1]]),
+        np.minimum(x, y),
+        np.where(x == y, x, y[0]),
+    ]
+    np.testing.assert_array_equal(out, rows)
+
+
+def test_reals_equal_numpy_and_a_nan_is_below_nothing():
+    xyz = np.random.default_rng(2).normal(scale=100.0, size=3 * LANES + 1).astype(np.float32)
+    xyz[[1, 8]] = np.nan
+    xyz[4] = xyz[5]
+    x, y, z = xyz[1:].reshape(LANES, 3).T
+    out, cut = np.zeros((2, LANES), np.float32), np.zeros(LANES, np.int32)
+    bits = reals(xyz, out, cut)
+    np.testing.assert_array_equal(out, [x + y * z, x - y])
+    np.testing.assert_array_equal(cut, np.trunc(z))
+    assert [bool(bits >> lane & 1) for lane in range(LANES)] == (x < y).tolist()
+
+
+def test_unsigned_numbers_become_floats():
+    a = np.linspace(0, 65535, LANES).astype(np.uint16)
+    out = np.zeros(LANES, np.float32)
+    converted(a, out)
+    np.testing.assert_array_equal(out, a)
 
 
 def test_lowest_bit():

@@ -10,7 +10,18 @@ from hypothesis import strategies as st
 from headvox.data import Cloud, DepthImage, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
-from headvox.voxelize import Lattice, voxelize_depth, voxelize_points
+from headvox.voxelize import (
+    Lattice,
+    Marking,
+    Rays,
+    mark_depth,
+    mark_points,
+    merge,
+    new_box,
+    part_transform,
+    voxelize_depth,
+    voxelize_points,
+)
 
 
 def same_grids(thing, region, voxel=0.05, subdivision=2):
@@ -273,3 +284,50 @@ def test_depth_and_its_cloud_fill_the_same_voxels():
     by_cloud = voxelize_points(Cloud("c", points, T), lattice, count=True).astype(int)
     assert by_depth.sum() > 300
     assert np.abs(by_depth - by_cloud).sum() <= 0.01 * by_depth.sum()
+
+
+# ------------------------------------------------------------------------------------------------- shares of a frame
+
+
+@pytest.mark.parametrize("counting", [False, True])
+def test_shares_merge_to_the_whole_and_tell_the_occupied_box(counting):
+    rng = np.random.default_rng(4)
+    lattice = Lattice.over(scenes.region(), 0.05, 2)
+    cloud = Cloud("c", scenes.messy_cloud(rng, 1000), scenes.pose(rng))
+    image = scenes.image_of_spheres(
+        rng, scenes.looking_along_x(-0.9, 0.0, 0.1), [(0.0, 0.0, 0.1, 0.1)], wall_m=1.2
+    )
+    rays, (height, width) = Rays.of(image, lattice), image.depth.shape
+    size = math.prod(lattice.shape)
+    box, grids = new_box(), [np.zeros(size, np.uint32 if counting else np.uint8) for _ in range(2)]
+    marking = Marking.of(width)
+    common = (lattice.limits(), lattice.shape, 1, counting)
+    for cells, points, rows in (
+        (grids[0], cloud.points[:617], (0, 5)),
+        (grids[1], cloud.points[617:], (5, height)),
+    ):
+        mark_points(points, part_transform(cloud, lattice), *common, *marking.for_points(), box, cells)
+        pixels = (image.depth, *rows, rays.column, rays.row, rays.t)
+        mark_depth(*pixels, *common, *marking.for_depth(width), box, cells)
+    merge(*grids, counting)
+    assert not grids[1].any()
+    cloud_cells, image_cells = (
+        voxelize_points(cloud, lattice, counting),
+        voxelize_depth(image, lattice, counting),
+    )
+    wanted = cloud_cells + image_cells if counting else cloud_cells | image_cells
+    assert (cloud_cells > 0).sum() > 50 < (image_cells > 0).sum()
+    np.testing.assert_array_equal(grids[0].reshape(lattice.shape), wanted)
+    at = np.argwhere(wanted)
+    assert box.tolist() == [*at.min(axis=0), *at.max(axis=0)]
+
+
+def test_nothing_in_range_leaves_the_box_empty():
+    lattice, box = Lattice.over(scenes.region(), 0.05, 2), new_box()
+    points, cells = np.full((5, 3), 99.0, np.float32), np.zeros(math.prod(lattice.shape), np.uint8)
+    T = part_transform(Cloud("c", points), lattice)
+    mark_points(
+        points, T, lattice.limits(), lattice.shape, 1, False, *Marking.of(32).for_points(), box, cells
+    )
+    assert box.tolist() == new_box().tolist()
+    assert not cells.any()

@@ -27,12 +27,12 @@ from headvox.visibility import camera_table, cells_of, count_states, look_about
 from headvox.vote import DROPPED, StageTables, seen_boxes, vote_masks, vote_stages
 from headvox.voxelize import (
     Lattice,
+    Marking,
     Rays,
     mark_depth,
     mark_points,
     merge,
-    new_span,
-    occupied_box,
+    new_box,
     part_transform,
 )
 
@@ -123,43 +123,42 @@ class Detector:
         lattice, parts = memory.lattice, self._threads.count
         limits, shape, shift = memory.limits, lattice.shape, lattice.subdivision - 1
         counting = self.cascade.source.counting
-        spans = [new_span() for _ in range(parts)]
+        boxes = [new_box() for _ in range(parts)]
+        memory.make_room_for_width(max((image.depth.shape[1] for image in frame.depths), default=0))
 
         def mark(part: int) -> None:
-            cells, span = memory.flat[part], spans[part]
+            cells, marking, box = memory.flat[part], memory.marking[part], boxes[part]
             for cloud in frame.clouds:
                 low, high = _share(len(cloud.points), part, parts)
                 T = part_transform(cloud, lattice)
-                mark_points(cloud.points[low:high], T, limits, shape, shift, counting, span, cells)
-            for image in frame.depths:
-                rays = self._rays_of(image, lattice)
-                low, high = _share(len(image.depth), part, parts)
-                mark_depth(
-                    image.depth,
-                    low,
-                    high,
-                    rays.column,
-                    rays.row,
-                    rays.t,
+                mark_points(
+                    cloud.points[low:high],
+                    T,
                     limits,
                     shape,
                     shift,
                     counting,
-                    span,
+                    *marking.for_points(),
+                    box,
                     cells,
                 )
+            for image in frame.depths:
+                rays, depth = self._rays_of(image, lattice), np.ascontiguousarray(image.depth)
+                low, high = _share(depth.shape[0], part, parts)
+                mark_depth(
+                    depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting,
+                    *marking.for_depth(depth.shape[1]), box, cells,
+                )  # fmt: skip
 
         self._threads.run(mark, [(part,) for part in range(parts)])
-        if all(span[1] < 0 for span in spans):
+        box = np.concatenate([np.min(boxes, axis=0)[:3], np.max(boxes, axis=0)[3:]])
+        memory.dirty = (max(int(box[0]), 0), int(box[3]) + 1)
+        if box[3] < 0:
             memory.dirty = (0, 0)
             raise _nothing_in_range(frame, lattice.region)
-        box = np.empty(6, np.int64)
-        for flat, span in zip(memory.flat[1:], spans[1:], strict=True):
-            if span[1] >= 0:
-                merge(memory.flat[0], flat, span, counting)
-        span = np.array([min(span[0] for span in spans), max(span[1] for span in spans)])
-        occupied_box(memory.cells[0], span, box)
-        memory.dirty = (int(box[0]), int(box[3]) + 1)
+        for cells in memory.cells[1:]:
+            filled = slice(*memory.dirty)
+            merge(memory.cells[0][filled].reshape(-1), cells[filled].reshape(-1), counting)
         return box
 
     def _integrate(self, memory: _Memory, occupied: I64, candidates: I64) -> npt.NDArray[Any]:
@@ -348,6 +347,7 @@ class _Memory:
         self.dirty: tuple[int, int] | None = (0, 0)
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
+        self.marking = [Marking.of(LANES) for _ in range(threads)]
         tables = [cascade.gate.boxes, *([cascade.stages.boxes] if cascade.stages is not None else [])]
         self.reach = box_reach(np.concatenate(tables))
         shape = shape_with_margins(lattice.shape, self.reach)
@@ -395,6 +395,11 @@ class _Memory:
         """Stand for another region of the same shape."""
         self.lattice = lattice
         self.limits = lattice.limits()
+
+    def make_room_for_width(self, pixels: int) -> None:
+        """Have room for images as wide as that."""
+        if len(self.marking[0].codes) < pixels:
+            self.marking = [Marking.of(pixels) for _ in self.marking]
 
     def make_room(self, candidates: int) -> None:
         """Have room for as many candidates."""

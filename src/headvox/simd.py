@@ -1,8 +1,8 @@
-"""Vectors of 32 integers inside kernels, where a loop over arrays leaves too much to the compiler's luck.
+"""Vectors of 32 numbers inside kernels, where a loop over arrays leaves too much to the compiler's luck.
 
 A kernel holds a :class:`Lanes` in registers, so a test of 32 voxels ends in one 32-bit number, and a branch on it being
 0 is the early exit. What is emitted is LLVM's own vector code and nothing of any processor: the compiler makes one
-AVX-512 instruction of it, two for AVX2 or four for NEON, with the same results. All arithmetic wraps around.
+AVX-512 instruction of it, two for AVX2 or four for NEON, with the same results. Whole numbers wrap around.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ intrinsic: Callable[[Callable[..., Any]], Callable[..., Any]] = extending.intrin
 
 
 class Lanes(types.Type):
-    """Numba's type for :data:`LANES` integers of so many bits, of which most operations need not know the sign."""
+    """Numba's type for :data:`LANES` numbers. Of integers only the width is told: most operations need no sign."""
 
-    def __init__(self, bits: int) -> None:
-        self.scalar = types.Integer.from_bitwidth(bits)
+    def __init__(self, scalar: Any) -> None:
+        whole = isinstance(scalar, types.Integer)
+        self.scalar = types.Integer.from_bitwidth(scalar.bitwidth) if whole else scalar
         super().__init__(f"Lanes({self.scalar})")
 
 
@@ -43,7 +44,7 @@ def load(typingctx, flat, at):  # type: ignore[no-untyped-def]
     def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.load(_pointer(context, builder, signature, arguments), align=_size(flat.dtype))
 
-    return Lanes(flat.dtype.bitwidth)(flat, at), emit
+    return Lanes(flat.dtype)(flat, at), emit
 
 
 @intrinsic
@@ -65,19 +66,50 @@ def fill(typingctx, value):  # type: ignore[no-untyped-def]
     def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return _spread(builder, arguments[0])
 
-    return Lanes(value.bitwidth)(value), emit
+    return Lanes(value)(value), emit
+
+
+@intrinsic
+def load_triples(typingctx, flat, at):  # type: ignore[no-untyped-def]
+    """Return three vectors: every third item of ``flat`` from ``at``, ``at + 1`` and ``at + 2`` on."""
+    lanes = Lanes(flat.dtype)
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        scalar = context.get_value_type(flat.dtype)
+        pointer = _pointer(context, builder, signature, arguments)
+        pointer = builder.bitcast(pointer, ir.VectorType(scalar, 3 * LANES).as_pointer())
+        items = builder.load(pointer, align=_size(flat.dtype))
+        rows = [
+            builder.shuffle_vector(items, items, ir.Constant(_vector(32), list(range(k, 3 * LANES, 3))))
+            for k in range(3)
+        ]
+        return context.make_tuple(builder, signature.return_type, rows)
+
+    return types.UniTuple(lanes, 3)(flat, at), emit
 
 
 @intrinsic
 def add(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return a + b, lane by lane."""
-    return _two(a, b, lambda builder, x, y: builder.add(x, y))
+    return _two(a, b, lambda builder, x, y: builder.add(x, y), lambda builder, x, y: builder.fadd(x, y))
 
 
 @intrinsic
 def sub(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return a - b, lane by lane."""
-    return _two(a, b, lambda builder, x, y: builder.sub(x, y))
+    return _two(a, b, lambda builder, x, y: builder.sub(x, y), lambda builder, x, y: builder.fsub(x, y))
+
+
+@intrinsic
+def mul(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return a * b, lane by lane."""
+    return _two(a, b, lambda builder, x, y: builder.mul(x, y), lambda builder, x, y: builder.fmul(x, y))
+
+
+@intrinsic
+def bit_and(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return a & b, lane by lane."""
+    return _two(a, b, lambda builder, x, y: builder.and_(x, y))
 
 
 @intrinsic
@@ -88,6 +120,81 @@ def times(typingctx, a, factor):  # type: ignore[no-untyped-def]
         return builder.mul(arguments[0], _spread(builder, arguments[1]))
 
     return a(a, a.scalar), emit
+
+
+@intrinsic
+def shift_right(typingctx, a, count):  # type: ignore[no-untyped-def]
+    """Return a >> count, as signed numbers, lane by lane."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.ashr(arguments[0], _spread(builder, arguments[1]))
+
+    return a(a, a.scalar), emit
+
+
+@intrinsic
+def to_float(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return unsigned integers as float32."""
+    lanes = Lanes(types.float32)
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.uitofp(arguments[0], ir.VectorType(ir.FloatType(), LANES))
+
+    return lanes(a), emit
+
+
+@intrinsic
+def to_int(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return float32 cut off to int32; anything at all where that does not fit."""
+    lanes = Lanes(types.int32)
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.fptosi(arguments[0], _vector(32))
+
+    return lanes(a), emit
+
+
+@intrinsic
+def below(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return a uint32 with bit k set where a < b in lane k, as signed numbers or float32; a NaN is below nothing."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        x, y = arguments
+        is_whole = isinstance(a.scalar, types.Integer)
+        bits = builder.icmp_signed("<", x, y) if is_whole else builder.fcmp_ordered("<", x, y)
+        return builder.bitcast(bits, ir.IntType(LANES))
+
+    return (types.uint32(a, b), emit) if a == b else None
+
+
+@intrinsic
+def equal(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return a uint32 with bit k set where the integers a and b are equal in lane k."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.bitcast(builder.icmp_signed("==", *arguments), ir.IntType(LANES))
+
+    return (types.uint32(a, b), emit) if a == b else None
+
+
+@intrinsic
+def where(typingctx, bits, a, b):  # type: ignore[no-untyped-def]
+    """Return a where bit k of a uint32 is set, and b elsewhere, lane by lane."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        number, x, y = arguments
+        return builder.select(builder.bitcast(number, ir.VectorType(ir.IntType(1), LANES)), x, y)
+
+    return (a(types.uint32, a, b), emit) if a == b else None
+
+
+@intrinsic
+def shifted(typingctx, before, a):  # type: ignore[no-untyped-def]
+    """Return ``a`` one lane on; the first lane is the last of ``before``."""
+    places = list(range(LANES - 1, 2 * LANES - 1))
+    return _two(
+        before, a, lambda builder, x, y: builder.shuffle_vector(x, y, ir.Constant(_vector(32), places))
+    )
 
 
 @intrinsic
@@ -208,11 +315,12 @@ def lowest(typingctx, bits):  # type: ignore[no-untyped-def]
     return types.int64(types.uint32), emit
 
 
-def _two(a: Any, b: Any, emit_on_vectors: Any) -> Any:
+def _two(a: Any, b: Any, on_integers: Any, on_reals: Any = None) -> Any:
     """Return what an intrinsic of two lanes of one type has to."""
+    instruction = on_integers if isinstance(a.scalar, types.Integer) else on_reals
 
     def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return emit_on_vectors(builder, *arguments)
+        return instruction(builder, *arguments)
 
     return (a(a, b), emit) if a == b else None
 

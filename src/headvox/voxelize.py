@@ -20,12 +20,34 @@ import numpy.typing as npt
 from headvox.data import F32, F64, U16, Cloud, DepthImage
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
-from headvox.kernels import kernel, rule
+from headvox.kernels import bare_kernel, rule
+from headvox.simd import (
+    LANES,
+    add,
+    below,
+    bit_and,
+    equal,
+    fill,
+    larger,
+    load,
+    load_triples,
+    lowest,
+    mul,
+    shift_right,
+    shifted,
+    smaller,
+    store,
+    sub,
+    times,
+    to_float,
+    to_int,
+    where,
+)  # fmt: skip
 
 NOWHERE = np.int32(-1)
 FARTHEST = np.int32(2**31 - 1)
 MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
-BLOCK = 1024  # points coded at a time: the codes stay in the first-level cache
+ALL = np.uint32(0xFFFFFFFF)
 
 Cells = npt.NDArray[np.uint8] | npt.NDArray[np.uint32]
 
@@ -96,158 +118,188 @@ class Lattice:
         return centres
 
 
-def new_span() -> npt.NDArray[np.int32]:
-    """Return an empty span of codes: lowest and highest."""
-    return np.array([FARTHEST, NOWHERE], dtype=np.int32)
+def new_box() -> npt.NDArray[np.int64]:
+    """Return an empty box of cells: lowest and highest in x, y, z."""
+    return np.array([FARTHEST, FARTHEST, FARTHEST, NOWHERE, NOWHERE, NOWHERE], dtype=np.int64)
 
 
 @rule
-def _code(x, y, z, limits, ny, nz, shift):  # type: ignore[no-untyped-def]
-    """Return cell * 8 + part of a place in parts from the origin, or NOWHERE if it is outside the region or NaN."""
-    dx = x - limits[0]
-    dy = y - limits[1]
-    dz = z - limits[2]
-    keep = (dx * dx + dy * dy + dz * dz < limits[3]) & (z >= limits[4]) & (z < limits[5])
-    ix = np.int32(x)
-    iy = np.int32(y)
-    iz = np.int32(z)
-    cell = ((ix >> shift) * ny + (iy >> shift)) * nz + (iz >> shift)
-    part = ((ix & shift) << 2) | ((iy & shift) << 1) | (iz & shift)
-    return (cell << 3 | part) if keep else NOWHERE
+def _inside(x, y, z, limits):  # type: ignore[no-untyped-def]
+    """Return a bit for each place, in parts from the origin: whether it is within the region, and not NaN."""
+    dx, dy, dz = sub(x, fill(limits[0])), sub(y, fill(limits[1])), sub(z, fill(limits[2]))
+    distance = add(add(mul(dx, dx), mul(dy, dy)), mul(dz, dz))
+    return below(distance, fill(limits[3])) & ~below(z, fill(limits[4])) & below(z, fill(limits[5]))
 
 
-@kernel
-def _code_points(xyz, T, limits, shape, shift, span, codes):  # type: ignore[no-untyped-def]
-    """Write the code of each point to ``codes``; widen ``span`` by them.
-
-    ``xyz`` is flat: with a row length that the compiler knows, it loads whole vectors.
-    """
-    ny, nz, m = np.int32(shape[1]), np.int32(shape[2]), np.int32(shift)
-    bounds = (limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
-    tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
-    xx, xy, xz = T[0, 0], T[0, 1], T[0, 2]
-    yx, yy, yz = T[1, 0], T[1, 1], T[1, 2]
-    zx, zy, zz = T[2, 0], T[2, 1], T[2, 2]
-    lowest, highest = span[0], span[1]
-    for i in range(xyz.shape[0] // 3):
-        px, py, pz = xyz[3 * i], xyz[3 * i + 1], xyz[3 * i + 2]
-        x = tx + (xx * px + xy * py + xz * pz)
-        y = ty + (yx * px + yy * py + yz * pz)
-        z = tz + (zx * px + zy * py + zz * pz)
-        code = _code(x, y, z, bounds, ny, nz, m)
-        codes[i] = code
-        lowest = min(lowest, code if code >= 0 else FARTHEST)
-        highest = max(highest, code)
-    span[0], span[1] = lowest, highest
+@rule
+def _code(x, y, z, ny, nz, shift):  # type: ignore[no-untyped-def]
+    """Return cell * 8 + part of places inside, given in whole parts."""
+    cell = add(times(add(times(shift_right(x, shift), ny), shift_right(y, shift)), nz), shift_right(z, shift))
+    one = fill(shift)
+    part = add(add(times(bit_and(x, one), 4), times(bit_and(y, one), 2)), bit_and(z, one))
+    return add(times(cell, 8), part)
 
 
-@kernel
-def _code_depth_row(line, column, row_x, row_y, row_z, t, limits, shape, shift, span, codes):  # type: ignore[no-untyped-def]
-    """As :func:`_code_points`, for one row of a depth image: a pixel's point is ``t + depth * (column + row)``."""
-    ny, nz, m = np.int32(shape[1]), np.int32(shape[2]), np.int32(shift)
-    bounds = (limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
-    tx, ty, tz = t[0], t[1], t[2]
-    column_x, column_y, column_z = column[0], column[1], column[2]
-    lowest, highest = span[0], span[1]
-    for u in range(line.shape[0]):
-        depth = np.float32(line[u])
-        x = tx + depth * (column_x[u] + row_x)
-        y = ty + depth * (column_y[u] + row_y)
-        z = tz + depth * (column_z[u] + row_z)
-        code = _code(x, y, z, bounds, ny, nz, m)
-        code = code if line[u] > 0 else NOWHERE
-        codes[u] = code
-        lowest = min(lowest, code if code >= 0 else FARTHEST)
-        highest = max(highest, code)
-    span[0], span[1] = lowest, highest
-
-
-@kernel
-def _mark(codes, counting, cells):  # type: ignore[no-untyped-def]
-    """Enter coded points into the flat grid; ``codes`` is used up.
-
-    What lies nowhere is taken out first, without a branch: whether a point is kept is nothing a processor can guess.
-    Indices are unsigned, because a signed one costs a check for counting from the end.
-    """
-    kept = np.uint64(0)
-    for i in range(codes.shape[0]):
-        code = codes[i]
-        codes[kept] = code
-        kept += np.uint64(code >= 0)
-    if counting:
-        for i in range(kept):
-            cells[np.uint32(codes[i]) >> np.uint32(3)] += 1
-    else:
-        for i in range(kept):
-            code = np.uint32(codes[i])
+@rule
+def _enter(codes, at, new, counting, cells):  # type: ignore[no-untyped-def]
+    """Enter those of the codes from ``at`` on whose bit is set in ``new``."""
+    while new:
+        code = np.uint32(codes[at + lowest(new)])
+        new &= new - np.uint32(1)
+        if counting:
+            cells[code >> np.uint32(3)] += 1
+        else:
             cells[code >> np.uint32(3)] |= np.uint8(1) << (code & np.uint32(7))
 
 
-@kernel
-def mark_points(points, T, limits, shape, shift, counting, span, cells):  # type: ignore[no-untyped-def]
-    """Enter ``points`` (N, 3) into ``cells`` and widen ``span``."""
-    codes = np.empty(BLOCK, np.int32)
-    xyz = points.reshape(-1)
-    for start in range(0, points.shape[0], BLOCK):
-        count = min(BLOCK, points.shape[0] - start)
-        _code_points(xyz[3 * start : 3 * (start + count)], T, limits, shape, shift, span, codes)
-        _mark(codes[:count], counting, cells)
+@rule
+def _mark(x, y, z, known, left, codes, at, limits, shape, shift, counting, extremes, cells):  # type: ignore[no-untyped-def]
+    """Enter LANES places, in parts from the origin, as far as their bits in ``known`` are set; return their codes.
+
+    ``left`` are the codes of the LANES places before, and ``codes`` from ``at`` on are others that these may repeat:
+    neighbours mostly fall into one part, and a part is entered but once. ``codes`` is overwritten.
+    """
+    inside = known & _inside(x, y, z, limits)
+    x, y, z = to_int(x), to_int(y), to_int(z)
+    mine = where(inside, _code(x, y, z, shape[1], shape[2], shift), fill(NOWHERE))
+    new = inside
+    if not counting:
+        new &= ~(equal(mine, shifted(left, mine)) | equal(mine, load(codes, at)))
+    store(codes, at, mine)
+    if new:
+        _widen(extremes, 0, new, shift_right(x, shift))
+        _widen(extremes, 1, new, shift_right(y, shift))
+        _widen(extremes, 2, new, shift_right(z, shift))
+        _enter(codes, at, new, counting, cells)
+    return mine
 
 
-@kernel
-def mark_depth(depth, first, last, column, row, t, limits, shape, shift, counting, span, cells):  # type: ignore[no-untyped-def]
-    """Enter rows ``first`` to ``last`` (exclusive) of a depth image into ``cells`` and widen ``span``."""
-    codes = np.empty(depth.shape[1], np.int32)
-    for v in range(first, last):
-        _code_depth_row(
-            depth[v], column, row[0, v], row[1, v], row[2, v], t, limits, shape, shift, span, codes
+@rule
+def _widen(extremes, axis, new, cell):  # type: ignore[no-untyped-def]
+    low, high = load(extremes, axis * LANES), load(extremes, (axis + 3) * LANES)
+    store(extremes, axis * LANES, where(new, smaller(low, cell), low))
+    store(extremes, (axis + 3) * LANES, where(new, larger(high, cell), high))
+
+
+@rule
+def _begin(codes, extremes):  # type: ignore[no-untyped-def]
+    """Forget what was entered before: the grid may have been emptied since."""
+    codes[:] = NOWHERE
+    extremes[: 3 * LANES] = FARTHEST
+    extremes[3 * LANES :] = NOWHERE
+
+
+@rule
+def _end(extremes, box):  # type: ignore[no-untyped-def]
+    """Widen ``box`` by all that was entered."""
+    for k in range(3 * LANES):
+        box[k // LANES] = min(box[k // LANES], extremes[k])
+        box[3 + k // LANES] = max(box[3 + k // LANES], extremes[3 * LANES + k])
+
+
+@bare_kernel
+def mark_points(points, T, limits, shape, shift, counting, codes, extremes, few, box, cells):  # type: ignore[no-untyped-def]
+    """Enter ``points`` (N, 3) into the flat grid ``cells``, and widen ``box``, see :func:`new_box`.
+
+    ``codes`` (LANES,), ``extremes`` and ``few`` are working memory, see :class:`Marking`.
+    """
+    xyz, m = points.reshape(-1), np.int32(shift)
+    _begin(codes, extremes)
+    left = fill(NOWHERE)
+    for at in range(0, xyz.shape[0], 3 * LANES):
+        if at + 3 * LANES <= xyz.shape[0]:
+            px, py, pz = load_triples(xyz, at)
+        else:
+            few[:] = np.nan
+            for k in range(xyz.shape[0] - at):
+                few[k] = xyz[at + k]
+            px, py, pz = load_triples(few, 0)
+        x = add(
+            fill(T[0, 3]), add(add(mul(fill(T[0, 0]), px), mul(fill(T[0, 1]), py)), mul(fill(T[0, 2]), pz))
         )
-        _mark(codes, counting, cells)
+        y = add(
+            fill(T[1, 3]), add(add(mul(fill(T[1, 0]), px), mul(fill(T[1, 1]), py)), mul(fill(T[1, 2]), pz))
+        )
+        z = add(
+            fill(T[2, 3]), add(add(mul(fill(T[2, 0]), px), mul(fill(T[2, 1]), py)), mul(fill(T[2, 2]), pz))
+        )
+        left = _mark(x, y, z, ALL, left, codes, 0, limits, shape, m, counting, extremes, cells)
+    _end(extremes, box)
 
 
-@kernel
-def occupied_box(cells, span, box):  # type: ignore[no-untyped-def]
-    """Write to ``box`` the lowest and highest occupied cell in x, y, z; the codes in ``cells`` lie within ``span``."""
-    _, ny, nz = cells.shape
-    box[0], box[3] = (span[0] >> 3) // (ny * nz), (span[1] >> 3) // (ny * nz)
-    box[1], box[4] = ny, -1
-    over = np.zeros(nz, np.uint8)
-    for x in range(box[0], box[3] + 1):
-        for y in range(ny):
-            column = cells[x, y]
-            any_bits = np.uint8(0)
-            for z in range(nz):
-                bit = np.uint8(column[z] != 0)
-                any_bits |= bit
-                over[z] |= bit
-            if any_bits:
-                box[1] = min(box[1], y)
-                box[4] = max(box[4], y)
-    box[2], box[5] = nz, -1
-    for z in range(nz):
-        if over[z]:
-            box[2] = min(box[2], z)
-            box[5] = z
+@bare_kernel
+def mark_depth(  # type: ignore[no-untyped-def]
+    depth, first, last, column, row, t, limits, shape, shift, counting, codes, extremes, few, box, cells
+):
+    """As :func:`mark_points`, for rows ``first`` to ``last`` (exclusive) of a depth image, see :class:`Rays`.
+
+    ``codes`` is as long as ``column``: a pixel's neighbours are the one before it and the one above.
+    """
+    flat, width, m = depth.reshape(-1), depth.shape[1], np.int32(shift)
+    _begin(codes, extremes)
+    for v in range(first, last):
+        left = fill(NOWHERE)
+        for u in range(0, width, LANES):
+            if u + LANES <= width:
+                raw = load(flat, v * width + u)
+            else:
+                few[:] = 0
+                for k in range(width - u):
+                    few[k] = flat[v * width + u + k]
+                raw = load(few, 0)
+            far = to_float(raw)
+            x = add(fill(t[0]), mul(far, add(load(column[0], u), fill(row[0, v]))))
+            y = add(fill(t[1]), mul(far, add(load(column[1], u), fill(row[1, v]))))
+            z = add(fill(t[2]), mul(far, add(load(column[2], u), fill(row[2, v]))))
+            known = ~equal(raw, sub(raw, raw))
+            left = _mark(x, y, z, known, left, codes, u, limits, shape, m, counting, extremes, cells)
+    _end(extremes, box)
 
 
-@kernel
-def merge(cells, other, span, counting):  # type: ignore[no-untyped-def]
-    """Add what another thread marked within ``span`` of the flat grid, and clear it there."""
-    first, last = span[0] >> 3, (span[1] >> 3) + 1
-    mine, theirs = cells[first:last], other[first:last]
+@bare_kernel
+def merge(cells, other, counting):  # type: ignore[no-untyped-def]
+    """Add what another thread entered into the flat grid ``other``, and clear it there."""
     if counting:
-        for i in range(mine.shape[0]):
-            mine[i] += theirs[i]
+        for i in range(cells.shape[0]):
+            cells[i] += other[i]
     else:
-        for i in range(mine.shape[0]):
-            mine[i] |= theirs[i]
-    theirs[:] = 0
+        for i in range(cells.shape[0]):
+            cells[i] |= other[i]
+    other[:] = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Marking:
+    """The working memory of one thread that enters readings into a grid."""
+
+    codes: npt.NDArray[np.int32]
+    extremes: npt.NDArray[np.int32]
+    few_points: F32
+    few_pixels: U16
+
+    @classmethod
+    def of(cls, width: int) -> Marking:
+        """Return memory for images as wide as that, and for points."""
+        codes, extremes = np.empty(_whole_vectors(width), np.int32), np.empty(6 * LANES, np.int32)
+        return cls(codes, extremes, np.empty(3 * LANES, np.float32), np.empty(LANES, np.uint16))
+
+    def for_points(self) -> tuple[npt.NDArray[Any], ...]:
+        """Return what :func:`mark_points` needs."""
+        return self.codes[:LANES], self.extremes, self.few_points
+
+    def for_depth(self, width: int) -> tuple[npt.NDArray[Any], ...]:
+        """Return what :func:`mark_depth` needs for an image as wide as that, as wide as it was made for at most."""
+        return self.codes[: _whole_vectors(width)], self.extremes, self.few_pixels
+
+
+def _whole_vectors(width: int) -> int:
+    return -(-width // LANES) * LANES
 
 
 @dataclass(frozen=True, slots=True)
 class Rays:
     """A depth camera as the kernels read it: a pixel's point, in parts from the lattice's origin, is
-    ``t + depth * (column[:, u] + row[:, v])`` with the raw depth value.
+    ``t + depth * (column[:, u] + row[:, v])`` with the raw depth value. ``column`` goes on to a whole vector.
     """
 
     column: F32
@@ -263,6 +315,7 @@ class Rays:
         down = (np.arange(camera.height) - camera.cy) / camera.fy
         column = (T[:3, 0, None] * across + T[:3, 2, None]) * scale
         row = T[:3, 1, None] * down * scale
+        column = np.pad(column, ((0, 0), (0, _whole_vectors(camera.width) - camera.width)))
         t = (T[:3, 3] - np.array(lattice.origin)) / lattice.part_m
         return cls(
             np.ascontiguousarray(column, dtype=np.float32),
@@ -282,36 +335,20 @@ def part_transform(cloud: Cloud, lattice: Lattice) -> F32:
 def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cells:
     """Return the grid of one cloud: uint8 parts, or uint32 points a voxel with ``count``; shape as the lattice."""
     cells: npt.NDArray[Any] = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
+    T, limits, memory = part_transform(cloud, lattice), lattice.limits(), Marking.of(LANES).for_points()
     mark_points(
-        cloud.points,
-        part_transform(cloud, lattice),
-        lattice.limits(),
-        lattice.shape,
-        lattice.subdivision - 1,
-        count,
-        new_span(),
-        cells,
-    )
+        cloud.points, T, limits, lattice.shape, lattice.subdivision - 1, count, *memory, new_box(), cells
+    )  # fmt: skip
     return cells.reshape(lattice.shape)
 
 
 def voxelize_depth(image: DepthImage, lattice: Lattice, count: bool = False) -> Cells:
     """Return the grid of one depth image, without making a cloud; else as :func:`voxelize_points`."""
     cells: npt.NDArray[Any] = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
-    rays = Rays.of(image, lattice)
-    depth: U16 = image.depth
+    rays, (height, width) = Rays.of(image, lattice), image.depth.shape
+    memory = Marking.of(width).for_depth(width)
     mark_depth(
-        depth,
-        0,
-        depth.shape[0],
-        rays.column,
-        rays.row,
-        rays.t,
-        lattice.limits(),
-        lattice.shape,
-        lattice.subdivision - 1,
-        count,
-        new_span(),
-        cells,
-    )
+        image.depth, 0, height, rays.column, rays.row, rays.t, lattice.limits(), lattice.shape,
+        lattice.subdivision - 1, count, *memory, new_box(), cells,
+    )  # fmt: skip
     return cells.reshape(lattice.shape)

@@ -210,7 +210,7 @@ def test_output_files_hold_what_json_prints(recording: Path, anything: Path, tmp
 def test_an_unknown_kind_of_output_is_wrong_usage(recording: Path, tmp_path: Path) -> None:
     done = headvox("run", recording, "-o", tmp_path / "out.txt")
     assert done.returncode == 2
-    assert ".jsonl or .csv" in done.stderr
+    assert ".jsonl, .csv or .tum" in done.stderr
     assert not (tmp_path / "out.txt").exists()
 
 
@@ -521,6 +521,51 @@ def test_help_and_import_are_light(statement: str) -> None:
     assert not imported & set(HEAVY)
 
 
-def test_help_tells_the_truth_about_tracking() -> None:
-    text = " ".join(headvox("run", "--help").stdout.split())
-    assert "no tracking yet" in text
+# ----------------------------------------------------------------------------------------------------------- tracking
+
+
+def test_a_run_tracks_unless_told_not_to(recording: Path, anything: Path) -> None:
+    done = headvox("run", recording, "--json", "--cascade", anything)
+    lines = heads_of(done.stdout)
+    assert {head["state"] for head in lines[0]} == {"tentative"}  # type: ignore[attr-defined]
+    assert {head["id"] for head in lines[0]} == {None}  # type: ignore[attr-defined]
+    confirmed = [head for head in lines[2] if head["state"] == "confirmed"]  # type: ignore[attr-defined]
+    assert [head["id"] for head in confirmed] == list(range(1, len(confirmed) + 1))
+    assert len(confirmed) > 0
+    for head in confirmed:
+        assert max(map(abs, head["velocity"])) < 0.05  # nothing moves here
+    table = headvox("run", recording, "--cascade", anything).stdout
+    rows = dict(line.rsplit(maxsplit=1) for line in table.splitlines() if line)
+    assert rows["heads with an id"] == str(len(confirmed))
+    assert "\ntrack " in table
+    bare = headvox("run", recording, "--cascade", anything, "--no-track").stdout
+    assert "heads with an id" not in bare
+    assert "\ntrack " not in bare
+
+
+def test_settings_of_the_tracker_by_flag_and_file(recording: Path, anything: Path, tmp_path: Path) -> None:
+    done = headvox("config", "--confirm-hits", 1, "--cascade", anything)
+    assert "\nconfirm_hits = 1\n" in done.stdout
+    (tmp_path / "mine.toml").write_text(done.stdout)
+    done = headvox("run", recording, "--json", "--limit", 1, "--config", tmp_path / "mine.toml")
+    assert {head["state"] for head in heads_of(done.stdout)[0]} == {"confirmed"}  # type: ignore[attr-defined]
+    more = ("--config", tmp_path / "mine.toml", "--confirm-hits", 2)
+    done = headvox("run", recording, "--json", "--limit", 1, *more)
+    assert {head["state"] for head in heads_of(done.stdout)[0]} == {"tentative"}  # type: ignore[attr-defined]
+    assert_explained(headvox("run", recording, "--confirm-hits", 9), 2)
+
+
+def test_a_trajectory_a_track(recording: Path, anything: Path, tmp_path: Path) -> None:
+    (tmp_path / "out_77.tum").write_text("of an older run\n")
+    (tmp_path / "out_x.tum").write_text("somebody else's\n")
+    done = headvox("run", recording, "--json", "--cascade", anything, "-o", tmp_path / "out.tum")
+    assert done.returncode == 0, done.stderr
+    confirmed = [head for head in heads_of(done.stdout)[2] if head["id"] is not None]  # type: ignore[attr-defined]
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"out_x.tum", *(f"out_{head['id']}.tum" for head in confirmed)}
+    for head in confirmed:
+        rows = np.loadtxt(tmp_path / f"out_{head['id']}.tum", ndmin=2)
+        np.testing.assert_allclose(rows[-1, :4], [0.2, *head["centre"]], atol=1e-9)
+        assert np.isnan(rows[-1, 4:]).all()
+    assert_explained(headvox("run", recording, "--no-track", "-o", tmp_path / "out.tum"), 2)
+    assert_explained(headvox("run", recording, "-o", tmp_path / "nowhere" / "out.tum"))

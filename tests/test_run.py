@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from headvox.data import BadFrame, Frame, Heads
+from headvox.data import BadFrame, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.run import Report, run
 from headvox.sinks import Result
@@ -39,7 +39,7 @@ class TwoHeads:
     def __init__(self) -> None:
         self.stage_ms = {"look": 1.0}
 
-    def detect_frame(self, frame: Frame) -> Heads:
+    def detect_frame(self, frame: Frame, expected: Expected | None = None) -> Heads:
         if frame.stamp_ns < 0:
             raise HeadvoxError("Before time.", "Wait.")
         return HEADS

@@ -68,8 +68,8 @@ def test_csv_has_a_row_a_head(tmp_path: Path) -> None:
     sink.write(RESULT)
     sink.close()
     assert (tmp_path / "out.csv").read_text() == (
-        "frame,stamp_ns,latency_ms,id,x,y,z,qx,qy,qz,qw,radius,score,vx,vy,vz\n"
-        "7,123456789012345678,2.1,,1.0,-2.0,0.0,0.0,0.0,0.6,0.8,0.11,3.25,,,\n"
+        "frame,stamp_ns,latency_ms,id,x,y,z,qx,qy,qz,qw,radius,score,vx,vy,vz,state\n"
+        "7,123456789012345678,2.1,,1.0,-2.0,0.0,0.0,0.0,0.6,0.8,0.11,3.25,,,,\n"
     )
 
 
@@ -82,7 +82,7 @@ def test_a_stream_is_not_closed() -> None:
 
 
 def test_files_that_cannot_be_written_are_explained(tmp_path: Path) -> None:
-    with pytest.raises(HeadvoxError, match=r"\.jsonl or \.csv"):
+    with pytest.raises(HeadvoxError, match=r"\.jsonl, \.csv or \.tum"):
         open_sink(tmp_path / "out.txt")
     with pytest.raises(HeadvoxError, match="No such file"):
         open_sink(tmp_path / "nowhere" / "out.csv")

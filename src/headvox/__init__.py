@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from headvox.errors import HeadvoxError as HeadvoxError
     from headvox.pipeline import Detector as Detector
     from headvox.sources import open_source as open_source
+    from headvox.track import Tracker as Tracker
 
 # Names are imported when they are first used: `import headvox` must not wait for Numba.
 _HOME = {
@@ -28,6 +29,7 @@ _HOME = {
     "Heads": "headvox.data",
     "HeadvoxError": "headvox.errors",
     "Intrinsics": "headvox.data",
+    "Tracker": "headvox.track",
     "open_source": "headvox.sources",
 }
 

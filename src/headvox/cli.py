@@ -23,7 +23,7 @@ from headvox.sinks import SUFFIXES
 from headvox.table import printable, table
 
 if TYPE_CHECKING:
-    from headvox.config import DetectorConfig
+    from headvox.config import Config, DetectorConfig, TrackerConfig
 
 GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -132,7 +132,9 @@ def _forget_stdout() -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    config = config_of(args)
+    config, tracker_config = config_of(args), tracker_config_of(args)
+    if args.no_track and args.output is not None and args.output.suffix == ".tum":
+        raise _UsageError("-o NAME.tum writes a file a track: it does not go with --no-track")
     from headvox.sinks import Sink, open_sink
     from headvox.sources import open_source
 
@@ -146,6 +148,7 @@ def _run(args: argparse.Namespace) -> int:
         from headvox.sinks.jsonl import JsonStream
         from headvox.sinks.summary import summary
         from headvox.sources.recording import RecordingSource
+        from headvox.track import Tracker
         from headvox.warmup import warm_up
 
         live = stack.enter_context(closing(Live(sys.stderr, source.length)))
@@ -165,6 +168,7 @@ def _run(args: argparse.Namespace) -> int:
             source,
             detector,
             sinks,
+            tracker=None if args.no_track else Tracker(tracker_config),
             strict=args.strict,
             limit=args.limit,
             on_bad=lambda index, reason: live.note(f"headvox: frame {index} skipped: {reason}"),
@@ -190,7 +194,7 @@ def _show_config(args: argparse.Namespace) -> int:
 
     config = config_of(args)
     load_cascade(config.cascade)  # a wrong name is to be told now, not when the file is used
-    print(to_toml(config), end="")
+    print(to_toml(config), to_toml(tracker_config_of(args)), sep="\n", end="")
     return GOOD
 
 
@@ -255,13 +259,23 @@ def sample_folder() -> Path:
 
 
 def config_of(args: argparse.Namespace) -> DetectorConfig:
-    """Return the settings: flags beat the file, the file beats the defaults."""
-    from dataclasses import fields, replace
-
+    """Return the settings of the detector: flags beat the file, the file beats the defaults."""
     from headvox.config import DetectorConfig, load_config
 
-    config = DetectorConfig() if args.config is None else load_config(args.config)
-    names = [field.name for field in fields(DetectorConfig)]
+    return _with_flags(DetectorConfig() if args.config is None else load_config(args.config), args)
+
+
+def tracker_config_of(args: argparse.Namespace) -> TrackerConfig:
+    """Return the settings of the tracker, in the same way."""
+    from headvox.config import TrackerConfig, load_tracker_config
+
+    return _with_flags(TrackerConfig() if args.config is None else loadtracker_config_of(args.config), args)
+
+
+def _with_flags(config: Config, args: argparse.Namespace) -> Config:
+    from dataclasses import fields, replace
+
+    names = [field.name for field in fields(config)]
     flags = {name: getattr(args, name) for name in names if getattr(args, name, None) is not None}
     if "centre" in flags:
         flags["centre"] = tuple(flags["centre"])
@@ -314,12 +328,12 @@ def _parser() -> argparse.ArgumentParser:
         dest="output",
         type=output_file,
         metavar="OUT",
-        help=f"also write a file: {' or '.join(SUFFIXES)}",
+        help=f"also write a file: {_either(SUFFIXES)}; NAME.tum writes a trajectory a track, NAME_ID.tum",
     )
     run.add_argument(
         "--no-track",
         action="store_true",
-        help="bare detections; this version has no tracking yet: ids and velocities are null either way",
+        help="every frame by itself: bare detections, without ids and velocities",
     )
     run.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
     run.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
@@ -394,8 +408,17 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--voxel", dest="voxel_m", type=number, metavar="M", help="edge of a voxel")
     group.add_argument("--refine", choices=("sphere", "none"), help="how a centre is sharpened")
     group.add_argument(
+        "--score-slack",
+        type=number,
+        metavar="S",
+        help="how much less a head may score where a tracker expects it",
+    )
+    group.add_argument(
         "--threads", type=whole_number, metavar="N", help="threads for a frame; the heads are the same"
     )
+    tracker = parser.add_argument_group("settings of the tracker", "the same holds")
+    for flag, name, kind, metavar, text in TRACKER_FLAGS:
+        tracker.add_argument(flag, dest=name, type=kind, metavar=metavar, help=text)
 
 
 # argparse names these three in its messages: "invalid number value: 'x'".
@@ -421,10 +444,47 @@ def output_file(text: str) -> Path:
     """Return the path of a file that a sink can write."""
     path = Path(text)
     if path.suffix not in SUFFIXES:
-        raise argparse.ArgumentTypeError(
-            f"expected a name that ends with {' or '.join(SUFFIXES)}, got {text!r}"
-        )
+        raise argparse.ArgumentTypeError(f"expected a name that ends with {_either(SUFFIXES)}, got {text!r}")
     return path
+
+
+def _either(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+TRACKER_FLAGS = (
+    ("--confirm-hits", "confirm_hits", whole_number, "N", "a new head gets an id when it was seen in N ..."),
+    ("--confirm-frames", "confirm_frames", whole_number, "N", "... of N frames in a row"),
+    (
+        "--gate-sigmas",
+        "gate_sigmas",
+        number,
+        "K",
+        "how far from its prediction a head is sought, in standard deviations",
+    ),
+    (
+        "--speed-change",
+        "speed_change_m_s",
+        number,
+        "M/S",
+        "how much the velocity of a moving head changes within a second",
+    ),
+    (
+        "--turn-change",
+        "turn_change_deg_s",
+        number,
+        "DEG/S",
+        "how much a head's turn rate changes within a second",
+    ),
+    ("--empty", "empty_s", number, "S", "a track ends when its place is seen to be empty for so long"),
+    ("--out-of-view", "out_of_view_s", number, "S", "... or is out of every sensor's view"),
+    ("--missed", "missed_s", number, "S", "... or is in view, but nothing is found there"),
+    ("--weak", "weak_s", number, "S", "... or only what scores too little to be a head by itself"),
+    ("--hidden", "hidden_s", number, "S", "... or is hidden behind something"),
+    ("--remember", "remember_s", number, "S", "how long a head that was lost is the same when it comes back"),
+    ("--sight", "sight_m", number, "M", "how far the sensors see"),
+    ("--reset", "reset_s", number, "S", "a jump back in time by more than this begins anew"),
+)
 
 
 if __name__ == "__main__":

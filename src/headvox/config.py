@@ -10,7 +10,7 @@ import sys
 from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from headvox.errors import HeadvoxError
 
@@ -40,12 +40,15 @@ class DetectorConfig:
     """Edge of a voxel; by default the cascade's own."""
     refine: str = "sphere"
     """How a candidate's centre is sharpened: "sphere" (fit to the surface voxels) or "none"."""
+    score_slack: float = 1.0
+    """Where a tracker expects a head, it may score this much less than others."""
     threads: int = 1
     """Threads a frame is split over. The output does not depend on it."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
             _check_type(field.name, getattr(self, field.name))
+        _require(self.score_slack >= 0.0, "score_slack", "at least 0", self.score_slack)
         if self.centre is not None:
             object.__setattr__(self, "centre", tuple(float(v) for v in self.centre))
         _require(
@@ -59,6 +62,58 @@ class DetectorConfig:
         _require(1 <= self.threads <= 64, "threads", "1 to 64", self.threads)
         if self.voxel_m is not None:
             _require(0.005 <= self.voxel_m <= 0.2, "voxel_m", "0.005 to 0.2 m", self.voxel_m)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerConfig:
+    """Everything a :class:`~headvox.track.Tracker` can be told."""
+
+    confirm_hits: int = 3
+    """A new head gets an id when it was seen in so many ..."""
+    confirm_frames: int = 5
+    """... of so many frames in a row."""
+    gate_sigmas: float = 4.0
+    """A detection farther than this from where a track should be, in standard deviations, is not its head."""
+    speed_change_m_s: float = 1.0
+    """How much the velocity of a moving head changes within a second (standard deviation, each axis)."""
+    turn_change_deg_s: float = 200.0
+    """How much a head's turn rate changes within a second (standard deviation, each axis)."""
+    empty_s: float = 0.3
+    """A track ends when its place is seen to be empty for so long ..."""
+    out_of_view_s: float = 0.5
+    """... or is out of every sensor's view for so long ..."""
+    missed_s: float = 1.0
+    """... or is in view, but nothing is found there ..."""
+    weak_s: float = 2.0
+    """... or only what scores too little to be a head by itself ..."""
+    hidden_s: float = 3.0
+    """... or is hidden behind something for so long."""
+    remember_s: float = 5.0
+    """A head that turns up where one was lost is the same one, up to so long after it was last seen."""
+    sight_m: float = 5.0
+    """How far the sensors see."""
+    reset_s: float = 1.0
+    """When time jumps back by more than this, a recording began again: everything is forgotten."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("confirm_hits", "confirm_frames"):
+                _require(
+                    isinstance(value, Integral) and _is_number(value, 1e9),
+                    field.name,
+                    "a whole number",
+                    value,
+                )
+            else:
+                _require(_is_number(value, 1e9) and value > 0, field.name, "a number above 0", value)
+        hits, frames = self.confirm_hits, self.confirm_frames
+        _require(1 <= hits <= 60, "confirm_hits", "1 to 60", hits)
+        _require(hits <= frames <= 60, "confirm_frames", f"confirm_hits ({hits}) to 60", frames)
+
+
+TABLES: dict[type, str] = {DetectorConfig: "detector", TrackerConfig: "track"}
+Config = TypeVar("Config", DetectorConfig, TrackerConfig)
 
 
 def _require(good: bool, key: str, expected: str, got: object) -> None:
@@ -75,11 +130,20 @@ def _short(value: object) -> str:
 
 
 def load_config(path: str | Path) -> DetectorConfig:
-    """Read the ``[detector]`` table of a TOML file.
+    """Read the ``[detector]`` table of a TOML file; what it leaves out has its default.
 
     Raises:
         HeadvoxError: the file is missing, is no TOML, or has an unknown key or a value of the wrong type.
     """
+    return _load(path, DetectorConfig)
+
+
+def load_tracker_config(path: str | Path) -> TrackerConfig:
+    """Read the ``[track]`` table of a TOML file, as :func:`load_config` does the other."""
+    return _load(path, TrackerConfig)
+
+
+def _load(path: str | Path, kind: type[Config]) -> Config:
     try:
         tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -88,23 +152,30 @@ def load_config(path: str | Path) -> DetectorConfig:
         raise HeadvoxError(
             f"Configuration {path} is not TOML: {error}.", "`headvox config` prints one."
         ) from None
-    unknown = sorted(set(tables) - {"detector"})
+    names = sorted(TABLES.values())
+    unknown = sorted(set(tables) - set(names))
     if unknown:
-        raise HeadvoxError(f"Configuration {path}: unknown table [{unknown[0]}].", "Expected [detector].")
-    values = tables.get("detector", {})
+        expected = " and ".join(f"[{name}]" for name in names)
+        raise HeadvoxError(f"Configuration {path}: unknown table [{unknown[0]}].", f"Expected {expected}.")
+    name = TABLES[kind]
+    values = tables.get(name, {})
     if not isinstance(values, dict):
-        raise HeadvoxError(f"Configuration {path}: detector: expected a table.", "Write [detector].")
-    return from_mapping(values, str(path))
+        raise HeadvoxError(f"Configuration {path}: {name}: expected a table.", f"Write [{name}].")
+    return _over_defaults(kind, values, str(path))
 
 
 def from_mapping(values: dict[str, Any], origin: str) -> DetectorConfig:
     """Return a configuration with ``values`` over the defaults; ``origin`` names them in errors."""
-    known = {field.name for field in fields(DetectorConfig)}
+    return _over_defaults(DetectorConfig, values, origin)
+
+
+def _over_defaults(kind: type[Config], values: dict[str, Any], origin: str) -> Config:
+    known = {field.name for field in fields(kind)}
     for key in values:
         if key not in known:
             raise HeadvoxError(f"{origin}: unknown setting {key!r}.", f"Known: {', '.join(sorted(known))}.")
     try:
-        return replace(DetectorConfig(), **values)
+        return replace(kind(), **values)
     except HeadvoxError as error:
         raise HeadvoxError(f"{origin}: {error.what}", error.do) from None
 
@@ -127,9 +198,9 @@ def _is_number(value: object, most: float) -> bool:
     return not isinstance(value, bool) and isinstance(value, Real) and -most <= value <= most  # type: ignore[operator]
 
 
-def to_toml(config: DetectorConfig) -> str:
-    """Return ``config`` as TOML; settings that are left to headvox are commented out."""
-    lines = ["[detector]"]
+def to_toml(config: DetectorConfig | TrackerConfig) -> str:
+    """Return ``config`` as a table of TOML; settings that are left to headvox are commented out."""
+    lines = [f"[{TABLES[type(config)]}]"]
     for field in fields(config):
         value = getattr(config, field.name)
         if value is None:

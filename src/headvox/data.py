@@ -7,8 +7,10 @@ y down, z forward); a head frame is x out of the face, y to the person's left, z
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +93,8 @@ class Heads:
     ``centre_covariances``   (N, 3, 3) float64, m², world axes; NaN where not known
     ``rotation_covariances`` (N, 3, 3) float64, rad², of the small turn d in R_true = R_stated exp(d), head axes; NaN
                              where the orientation is not known
+    ``sure``        (N,) bool; False where the score is below the threshold, and the head was kept only because a
+                             tracker expected one there
     """
 
     centres: F64 = field(default_factory=lambda: _empty(0, 3))
@@ -99,8 +103,11 @@ class Heads:
     scores: F64 = field(default_factory=lambda: _empty(0))
     centre_covariances: F64 = field(default_factory=lambda: _empty(0))
     rotation_covariances: F64 = field(default_factory=lambda: _empty(0))
+    sure: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
 
     def __post_init__(self) -> None:
+        if len(self.sure) != len(self.scores):
+            object.__setattr__(self, "sure", np.ones(len(self.scores), np.bool_))
         for name in ("centre_covariances", "rotation_covariances"):
             if len(getattr(self, name)) != len(self.scores) or getattr(self, name).ndim != 3:
                 object.__setattr__(self, name, np.full((len(self.scores), 3, 3), np.nan))
@@ -137,6 +144,80 @@ class Head:
     """One row of :class:`Heads`."""
 
     centre: F64
+    quaternion: F64
+    radius: float
+    score: float
+
+
+class State(IntEnum):
+    """How sure a track is of its head."""
+
+    TENTATIVE = 0
+    """Seen, but not often enough to be given an id."""
+    CONFIRMED = 1
+    """Seen in this frame."""
+    COASTING = 2
+    """Confirmed, not seen in this frame: where it should be by now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """The heads that are followed, at one moment: structure of arrays, those with an id first, in its order.
+
+    ``stamp_ns``    the moment
+    ``ids``         (N,) int64, from 1; 0 while tentative
+    ``states``      (N,) int64, a :class:`State` each
+    ``centres``     (N, 3) float64, metres, world frame
+    ``velocities``  (N, 3) float64, m/s, world frame
+    ``quaternions`` (N, 4) float64, x y z w, world from head; a row of NaN where the orientation is not known
+    ``rates``       (N, 3) float64, rad/s, turn rate in head axes; a row of NaN where the orientation is not known
+    ``radii``       (N,) float64, metres, of the last detection
+    ``scores``      (N,) float64, of the last detection
+    ``covariances`` (N, 6, 6) float64, of centre and velocity (m, m/s), world axes
+    ``rotation_covariances`` (N, 3, 3) float64, rad², as those of :class:`Heads`
+    ``ages_s``      (N,) float64, seconds since the head was first seen
+    ``unseen_s``    (N,) float64, seconds since it was last seen; 0 if in this frame
+    """
+
+    stamp_ns: int
+    ids: I64
+    states: I64
+    centres: F64
+    velocities: F64
+    quaternions: F64
+    rates: F64
+    radii: F64
+    scores: F64
+    covariances: F64
+    rotation_covariances: F64
+    ages_s: F64
+    unseen_s: F64
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __iter__(self) -> Iterator[Track]:
+        for n in range(len(self)):
+            state = State(self.states[n])
+            yield Track(
+                int(self.ids[n]),
+                state,
+                self.centres[n],
+                self.velocities[n] if state != State.TENTATIVE else (math.nan,) * 3,
+                self.quaternions[n],
+                float(self.radii[n]),
+                float(self.scores[n]),
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A head as it is written: a row of :class:`Tracks`, or a bare head, without id (0), state and velocity (NaN)."""
+
+    id: int
+    state: State | None
+    centre: F64
+    velocity: Sequence[float] | F64
     quaternion: F64
     radius: float
     score: float

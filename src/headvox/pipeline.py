@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.config import DetectorConfig
-from headvox.data import F64, Cloud, DepthImage, Frame, Heads
+from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
@@ -89,8 +89,12 @@ class Detector:
             Frame(0, depths=(images,) if isinstance(images, DepthImage) else tuple(images))
         )
 
-    def detect_frame(self, frame: Frame) -> Heads:
-        """Return the heads in everything that the sensors saw at one moment."""
+    def detect_frame(self, frame: Frame, expected: Expected | None = None) -> Heads:
+        """Return the heads in everything that the sensors saw at one moment.
+
+        Within the reach of where a head is ``expected``, one that scores a little too low (``score_slack``) is kept
+        too, and marked as not sure.
+        """
         _check_frame(frame)
         clock = _Clock(self.stage_ms)
         memory = self._memory_for(frame)
@@ -106,9 +110,9 @@ class Detector:
         clock.done("vote")
         peaks = self._suppress(S, survivors, scores, memory)
         clock.done("suppress")
-        peaks, scores = self._judge(frame, S, survivors, scores, peaks, memory)
+        peaks, scores, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
         clock.done("judge")
-        heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, memory)
+        heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, least, memory)
         clock.done("refine")
         return heads
 
@@ -239,9 +243,19 @@ class Detector:
         return peaks
 
     def _judge(
-        self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: _Memory
-    ) -> tuple[I64, I64]:
-        """Let the peaks through that reach the cascade's threshold, after a look at what the cameras saw empty."""
+        self,
+        frame: Frame,
+        S: npt.NDArray[Any],
+        survivors: I32,
+        scores: I64,
+        peaks: I64,
+        memory: _Memory,
+        expected: Expected | None,
+    ) -> tuple[I64, I64, int]:
+        """Let the peaks through that reach the cascade's threshold, after a look at what the cameras saw empty.
+
+        Returned are the peaks, the scores of all survivors, and the threshold, in steps of the score.
+        """
         cascade, stages = self.cascade.source, self.cascade.stages
         sees = stages is not None and len(memory.offsets) > 0 and len(frame.depths) > 0 and not frame.clouds
         if sees and stages is not None and len(peaks):
@@ -272,9 +286,23 @@ class Detector:
         least = self.config.min_score
         if least is None:
             least = cascade.min_score if sees or not memory.sees else cascade.min_score_occupied
-        return peaks[scores[peaks] >= math.ceil(least * SCORE_UNIT)], scores
+        threshold = math.ceil(least * SCORE_UNIT)
+        kept = scores[peaks] >= threshold
+        if expected is not None and len(expected):
+            weaker = scores[peaks] >= threshold - math.floor(self.config.score_slack * SCORE_UNIT)
+            kept |= weaker & self._is_expected(survivors[peaks], expected, memory)
+        return peaks[kept], scores, threshold
 
-    def _refine(self, frame: Frame, cells: I32, scores: I64, peaks: I64, memory: _Memory) -> Heads:
+    def _is_expected(self, cells: I32, expected: Expected, memory: _Memory) -> npt.NDArray[np.bool_]:
+        """Whether each of ``cells`` is within reach of any place where a head is expected."""
+        centres = memory.lattice.centres(cells + memory.longer[:3])
+        away = np.linalg.norm(centres[:, None] - expected.centres, axis=2)
+        within: npt.NDArray[np.bool_] = (away <= expected.reaches_m + memory.lattice.voxel_m).any(axis=1)
+        return within
+
+    def _refine(
+        self, frame: Frame, cells: I32, scores: I64, peaks: I64, least: int, memory: _Memory
+    ) -> Heads:
         count = len(cells)
         if count == 0:
             return Heads()
@@ -297,7 +325,13 @@ class Detector:
         if self.cascade.votes is not None:
             half = 0.5 * self.cascade.votes.yaws_rad[memory.yaws[peaks]]
             quaternions = np.stack([np.zeros(count), np.zeros(count), np.sin(half), np.cos(half)], axis=1)
-        return Heads(centres[kept], quaternions[kept], radii[kept], scores[kept] / SCORE_UNIT)
+        return Heads(
+            centres[kept],
+            quaternions[kept],
+            radii[kept],
+            scores[kept] / SCORE_UNIT,
+            sure=scores[kept] >= least,
+        )
 
     # -------------------------------------------------------------------------------------------- working memory
 

@@ -7,12 +7,15 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from headvox.data import BadFrame, Frame, Heads
+from headvox.data import BadFrame, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.sinks import Result, Sink
 from headvox.sources import Source
+
+if TYPE_CHECKING:
+    from headvox.track import Tracker
 
 RECENT = 100_000  # frames that the percentiles look back over: a run may last for weeks
 
@@ -22,8 +25,8 @@ class FrameDetector(Protocol):
 
     stage_ms: dict[str, float]
 
-    def detect_frame(self, frame: Frame) -> Heads:
-        """Return the heads in one frame."""
+    def detect_frame(self, frame: Frame, expected: Expected | None = None) -> Heads:
+        """Return the heads in one frame; ``expected`` tells where a tracker expects them."""
         ...
 
 
@@ -39,7 +42,12 @@ class Report:
     """Frames that the source gave, bad ones included."""
     bad: int = 0
     heads: int = 0
+    """Heads that were found; those that a tracker only expects do not count."""
     frames_with_heads: int = 0
+    ids: int | None = None
+    """How many heads were given an id; None without a tracker."""
+    untracked: dict[str, int] = field(default_factory=dict)
+    """Frames whose stamp did not go on, by what was wrong: see :class:`~headvox.track.Tracker`."""
     seconds: float = 0.0
     """Wall time of the whole loop: reading, detecting, writing."""
     latency_ms: deque[float] = field(default_factory=_recent)
@@ -62,18 +70,20 @@ def run(
     detector: FrameDetector,
     sinks: Sequence[Sink] = (),
     *,
+    tracker: Tracker | None = None,
     strict: bool = False,
     limit: int | None = None,
     on_bad: Callable[[int, str], None] | None = None,
     on_frame: Callable[[Report], None] | None = None,
 ) -> Report:
-    """Run ``detector`` over ``source``, hand each result to every sink, and return what happened.
+    """Run ``detector`` and ``tracker`` over ``source``, hand each result to every sink, and return what happened.
 
     A frame that cannot be read or used is counted, told to ``on_bad`` (its index, the reason) and skipped.
     ``on_frame`` is called after every frame. Ctrl-C ends the run as the end of the source does, the
     report tells. Neither source nor sinks are closed.
 
     Args:
+        tracker: without one, every frame is by itself.
         strict: end at the first bad frame.
         limit: end after this many frames.
 
@@ -86,7 +96,7 @@ def run(
         for index, frame in enumerate(islice(iter(source), limit)):
             report.frames += 1
             try:
-                result = _detect(detector, frame, index)
+                result, stage_ms = _look(detector, tracker, frame, index)
             except HeadvoxError as error:
                 report.bad += 1
                 if strict or source.length == 1:
@@ -96,7 +106,10 @@ def run(
                 if on_bad is not None:
                     on_bad(index, str(error))
             else:
-                report.add(result, detector.stage_ms)
+                report.add(result, stage_ms)
+                if tracker is not None:
+                    report.ids = tracker.ids_given
+                    report.untracked = tracker.untracked
                 for sink in sinks:
                     sink.write(result)
             report.seconds = time.perf_counter() - begun
@@ -114,9 +127,24 @@ def run(
     return report
 
 
-def _detect(detector: FrameDetector, frame: Frame | BadFrame, index: int) -> Result:
+def _look(
+    detector: FrameDetector, tracker: Tracker | None, frame: Frame | BadFrame, index: int
+) -> tuple[Result, dict[str, float]]:
+    """Return what was found in a frame, and what each stage took."""
     if isinstance(frame, BadFrame):
         raise HeadvoxError(frame.reason)
     begun = time.perf_counter()
-    heads = detector.detect_frame(frame)
-    return Result(index, frame.stamp_ns, 1e3 * (time.perf_counter() - begun), heads)
+    if tracker is None:
+        heads = detector.detect_frame(frame)
+        return Result(index, frame.stamp_ns, _ms_since(begun), heads), detector.stage_ms
+    expected = tracker.expected(frame.stamp_ns)
+    expected_ms = _ms_since(begun)
+    heads = detector.detect_frame(frame, expected)
+    found = time.perf_counter()
+    tracks = tracker.update(heads, frame)
+    stage_ms = {**detector.stage_ms, "track": expected_ms + _ms_since(found)}
+    return Result(index, frame.stamp_ns, _ms_since(begun), heads, tracks), stage_ms
+
+
+def _ms_since(begun: float) -> float:
+    return 1e3 * (time.perf_counter() - begun)

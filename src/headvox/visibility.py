@@ -8,16 +8,24 @@ need no volume of their own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F32, DepthImage
+from headvox.data import F32, F64, DepthImage, Intrinsics
 from headvox.frames import inverse
 from headvox.kernels import kernel, rule
 from headvox.voxelize import Lattice
 
 HIDDEN, EMPTY = 1, 2
 NEAREST_M = 0.1  # a cell closer to the camera than this projects to nowhere useful
+
+# What may be seen of the place where a head should be; of several cameras the highest counts.
+OUT_OF_VIEW, NO_RETURN, BEHIND, SURFACE, SEEN_EMPTY = range(5)
+HEAD_M = 0.07  # how far from its centre a head is sampled: well inside of its outline
+IN_FRONT_M = 0.25  # the head's own face is some 10 cm nearer than its centre
+BEYOND_M = 0.15
 
 I32 = npt.NDArray[np.int32]
 
@@ -81,16 +89,79 @@ def count_states(states, start, seen):  # type: ignore[no-untyped-def]
             seen[i, b, 1] = hidden
 
 
+@kernel
+def look_at_places(depth, camera, fx, fy, scale, places, sight_m, states):  # type: ignore[no-untyped-def]
+    """Raise ``states`` (N,) to what one camera saw of each of ``places`` (N, 3), a head's size about each.
+
+    ``camera`` is (3, 4) float64: rows that give u·Z, v·Z and Z of a world point. Nine pixels of a grid about the place
+    are asked. It is SEEN_EMPTY when at least five of them measured well beyond it and fewer than two something about
+    it; BEHIND when most that measured anything measured well in front of it; NO_RETURN when fewer than five did.
+    """
+    for n in range(places.shape[0]):
+        x, y, z = places[n, 0], places[n, 1], places[n, 2]
+        far = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z + camera[2, 3]
+        if not NEAREST_M < far <= sight_m:
+            continue
+        u = (camera[0, 0] * x + camera[0, 1] * y + camera[0, 2] * z + camera[0, 3]) / far
+        v = (camera[1, 0] * x + camera[1, 1] * y + camera[1, 2] * z + camera[1, 3]) / far
+        inside = front = beyond = about = 0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                column = int(np.floor(u + i * HEAD_M * fx / far + 0.5))
+                row = int(np.floor(v + j * HEAD_M * fy / far + 0.5))
+                if column < 0 or row < 0 or column >= depth.shape[1] or row >= depth.shape[0]:
+                    continue
+                inside += 1
+                measured = depth[row, column] * scale
+                if measured == 0.0:
+                    continue
+                if measured > far + BEYOND_M:
+                    beyond += 1
+                elif measured >= far - IN_FRONT_M:
+                    about += 1
+                else:
+                    front += 1
+        if inside < 5:
+            state = OUT_OF_VIEW
+        elif beyond >= 5 and about < 2:
+            state = SEEN_EMPTY
+        elif front + beyond + about < 5:
+            state = NO_RETURN
+        elif 2 * front > front + beyond + about:
+            state = BEHIND
+        else:
+            state = SURFACE
+        states[n] = max(states[n], state)
+
+
+def see_places(images: Sequence[DepthImage], places: F64, sight_m: float) -> npt.NDArray[np.int64]:
+    """Return what the cameras saw of each of ``places`` (N, 3), in world coordinates: OUT_OF_VIEW to SEEN_EMPTY.
+
+    A camera sees ``sight_m`` far along its axis. A place that any camera saw to be empty is empty; one that is hidden
+    from all that look that way is BEHIND.
+    """
+    states = np.full(len(places), OUT_OF_VIEW, np.int64)
+    for image in images:
+        lens = image.intrinsics
+        camera = projection(lens) @ inverse(image.T_world_camera)[:3]
+        look_at_places(image.depth, camera, lens.fx, lens.fy, lens.depth_scale, places, sight_m, states)
+    return states
+
+
+def projection(camera: Intrinsics) -> F64:
+    """Return the (3, 3) matrix that maps a point of the camera's frame to u·Z, v·Z and Z."""
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
 def camera_table(image: DepthImage, lattice: Lattice) -> F32:
     """Return ``image``'s camera as :func:`look` reads it."""
-    c = image.intrinsics
-    K = np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]])
+    K = projection(image.intrinsics)
     T = inverse(image.T_world_camera)
     first = np.array(lattice.origin) + 0.5 * lattice.voxel_m  # the centre of cell 0, 0, 0
     table = np.zeros((4, 4))
     table[:3, :3] = K @ T[:3, :3] * lattice.voxel_m
     table[:3, 3] = K @ (T[:3, :3] @ first + T[:3, 3])
-    table[3, :3] = c.depth_scale, 0.03, 0.004
+    table[3, :3] = image.intrinsics.depth_scale, 0.03, 0.004
     return table.astype(np.float32)
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from headvox.config import DetectorConfig
-from headvox.data import Cloud, DepthImage, Frame, Intrinsics
+from headvox.data import Cloud, DepthImage, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
 from headvox.masks import CompiledCascade, load_cascade
 from headvox.pipeline import Detector
+from headvox.track import Tracker
 
 _ANYTHING = 1 << 40
 
@@ -36,8 +37,18 @@ def warm_up(config: DetectorConfig) -> None:
     ):  # Numba compiles a loop anew for arrays that lie in somebody else's buffer
         points.flags.writeable = wall.flags.writeable = writeable
         detector.detect_frame(Frame(0, clouds=(Cloud("warm-up", points),)))
-        detector.detect_frame(Frame(0, depths=(DepthImage("warm-up", wall, camera, np.eye(4)),)))
+        frame = Frame(0, depths=(DepthImage("warm-up", wall, camera, np.eye(4)),))
+        detector.detect_frame(frame)
+        _follow(frame)
     detector.close()
+
+
+def _follow(frame: Frame) -> None:
+    """Run a tracker over a head that is new, seen again, and looked for."""
+    tracker = Tracker()
+    head = Heads(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), np.full(1, 0.1), np.ones(1))
+    for k, heads in enumerate((head, head, Heads())):
+        tracker.update(heads, replace(frame, stamp_ns=k))
 
 
 def cache_folder() -> Path:

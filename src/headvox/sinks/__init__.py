@@ -7,6 +7,8 @@ complete. A sink raises :class:`~headvox.errors.HeadvoxError` when its file cann
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -14,9 +16,9 @@ from typing import TYPE_CHECKING, Protocol
 from headvox.errors import HeadvoxError
 
 if TYPE_CHECKING:
-    from headvox.data import Heads
+    from headvox.data import Heads, Track, Tracks
 
-SUFFIXES = (".jsonl", ".csv")
+SUFFIXES = (".jsonl", ".csv", ".tum")
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +26,25 @@ class Result:
     """What was found in one frame.
 
     ``frame`` counts the frames of the source from 0, bad ones included; ``latency_ms`` is the time of the
-    detection alone, without reading the frame.
+    detection and tracking, without reading the frame. ``tracks`` is None where nothing is tracked.
     """
 
     frame: int
     stamp_ns: int
     latency_ms: float
     heads: Heads
+    tracks: Tracks | None = None
+
+    def rows(self) -> Iterator[Track]:
+        """Return what there is to write, a row a head: the tracks, or the bare heads where nothing is tracked."""
+        from headvox.data import Track
+
+        if self.tracks is not None:
+            return iter(self.tracks)
+        return (
+            Track(0, None, head.centre, (math.nan,) * 3, head.quaternion, head.radius, head.score)
+            for head in self.heads
+        )
 
 
 class Sink(Protocol):
@@ -59,6 +73,11 @@ def open_sink(path: Path) -> Sink:
         from headvox.sinks.csvfile import CsvFile
 
         return CsvFile(path)
+    if path.suffix == ".tum":
+        from headvox.sinks.tum import TumFiles
+
+        return TumFiles(path)
     raise HeadvoxError(
-        f"Output {path}: expected a name that ends with {' or '.join(SUFFIXES)}.", "Rename it."
+        f"Output {path}: expected a name that ends with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}.",
+        "Rename it.",
     )

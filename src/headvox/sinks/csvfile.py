@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from headvox.data import Head
+from headvox.data import Track
 from headvox.sinks import Result
 from headvox.sinks.jsonl import DIGITS, METRE_DIGITS, number
 from headvox.sinks.linefile import LineFile
 
 COLUMNS = (
     "frame", "stamp_ns", "latency_ms", "id", "x", "y", "z", "qx", "qy", "qz", "qw", "radius", "score",
-    "vx", "vy", "vz",
+    "vx", "vy", "vz", "state",
 )  # fmt: skip
 
 
@@ -24,7 +24,7 @@ class CsvFile:
 
     def write(self, result: Result) -> None:
         """Write the rows of one frame."""
-        rows = [_row(result, head) for head in result.heads]
+        rows = [_row(result, row) for row in result.rows()]
         if rows:
             self._file.line("\n".join(rows))
 
@@ -33,16 +33,17 @@ class CsvFile:
         self._file.close()
 
 
-def _row(result: Result, head: Head) -> str:
+def _row(result: Result, row: Track) -> str:
     fields = [
         result.frame,
         result.stamp_ns,
         number(result.latency_ms, 3),
-        None,
-        *(number(value, METRE_DIGITS) for value in head.centre),
-        *(number(value, DIGITS) for value in head.quaternion),
-        number(head.radius, METRE_DIGITS),
-        number(head.score, DIGITS),
-        *(None, None, None),
+        row.id or None,
+        *(number(value, METRE_DIGITS) for value in row.centre),
+        *(number(value, DIGITS) for value in row.quaternion),
+        number(row.radius, METRE_DIGITS),
+        number(row.score, DIGITS),
+        *(number(value, METRE_DIGITS) for value in row.velocity),
+        None if row.state is None else row.state.name.lower(),
     ]
     return ",".join("" if field is None else str(field) for field in fields)

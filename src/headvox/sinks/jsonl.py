@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TextIO
 
-from headvox.data import Head
+from headvox.data import Track
 from headvox.sinks import Result
 from headvox.sinks.linefile import LineFile
 
@@ -53,21 +53,24 @@ def to_json(result: Result) -> str:
             "stamp_ns": result.stamp_ns,
             "frame": result.frame,
             "latency_ms": number(result.latency_ms, 3),
-            "heads": [_head(head) for head in result.heads],
+            "heads": [_head(row) for row in result.rows()],
         },
         allow_nan=False,
     )
 
 
-def _head(head: Head) -> dict[str, object]:
-    return {
-        "id": None,
-        "centre": _numbers(head.centre, METRE_DIGITS),
-        "quaternion": _numbers(head.quaternion, DIGITS),
-        "radius": number(head.radius, METRE_DIGITS),
-        "score": number(head.score, DIGITS),
-        "velocity": None,
+def _head(row: Track) -> dict[str, object]:
+    head: dict[str, object] = {
+        "id": row.id or None,
+        "centre": _numbers(row.centre, METRE_DIGITS),
+        "quaternion": _numbers(row.quaternion, DIGITS),
+        "radius": number(row.radius, METRE_DIGITS),
+        "score": number(row.score, DIGITS),
+        "velocity": _numbers(row.velocity, METRE_DIGITS),
     }
+    if row.state is not None:
+        head["state"] = row.state.name.lower()
+    return head
 
 
 def _numbers(values: Iterable[float], digits: int) -> list[float | None] | None:

@@ -14,10 +14,10 @@ class LineFile:
         HeadvoxError: the file cannot be made, or the disk is full.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, append: bool = False) -> None:
         self.path = path
         try:
-            self._file = path.open("wb", buffering=0)
+            self._file = path.open("ab" if append else "wb", buffering=0)
         except OSError as error:
             raise HeadvoxError(f"Output {path}: {error.strerror or error}.", "Check the path.") from None
 

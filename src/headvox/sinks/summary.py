@@ -9,6 +9,11 @@ from headvox.run import Report
 from headvox.table import table
 
 PERCENTILES = (50, 95, 99)
+_CLOCK = {
+    "repeated": "frames with the stamp of the one before, not tracked",
+    "late": "frames with an earlier stamp, not tracked",
+    "resets": "jumps back in time, tracks begun anew",
+}
 
 
 def summary(report: Report) -> str:
@@ -35,6 +40,8 @@ def _counts(report: Report) -> str:
         ["bad frames", str(report.bad)],
         ["heads", str(report.heads)],
         ["frames with heads", str(report.frames_with_heads)],
+        *([] if report.ids is None else [["heads with an id", str(report.ids)]]),
+        *([_CLOCK[what], str(count)] for what, count in report.untracked.items()),
         ["Hz, reading included", f"{hertz:.1f}"],
     ]
     return table([], rows)

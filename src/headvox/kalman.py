@@ -1,0 +1,303 @@
+"""The filters of a track: two linear motion models that share a position, and an orientation on its own manifold.
+
+Position: an interacting-multiple-model filter (Blom and Bar-Shalom, 1988) of two Kalman filters on position and
+velocity. The *still* model lets the position wander a little and has no velocity; the *moving* one has a velocity with
+white acceleration. The weight of each follows from how well it foretold what was measured, so a head at rest is
+smoothed hard, and one that sets off is followed at once.
+
+Orientation: an error-state (multiplicative) Kalman filter. The state is a quaternion q, world from head, and the turn
+rate in head axes [rad/s]; the covariance is that of the small turn d in R_true = R exp(d), and of the rate.
+
+Arrays have a row a track. ``x`` (N, 2, 6) position and velocity by the models; ``P`` (N, 2, 6, 6); ``weight`` (N, 2) of
+still and moving; ``q`` (N, 4) x y z w; ``rate`` (N, 3); ``C`` (N, 6, 6) covariance of turn and rate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from headvox.kernels import kernel, rule
+
+STILL, MOVING = 0, 1
+LEAST_WEIGHT = 1e-6  # a model is never ruled out for good
+FIRST_SPEED_M_S = 0.7  # how fast a head that was never seen before may move
+FIRST_RATE_RAD_S = 1.0
+STILL_SPEED_M_S = 0.01  # what the still model takes for rest
+REJECTED_BEFORE_RESET = 5  # orientations in a row that contradict a track before they are believed
+
+
+# --------------------------------------------------------------------------------------------------------------- rules
+
+
+@rule
+def _invert(S, out):  # type: ignore[no-untyped-def]
+    """Write the inverse of the symmetric (3, 3) ``S`` to ``out``; return its determinant."""
+    a = S[1, 1] * S[2, 2] - S[1, 2] * S[1, 2]
+    b = S[0, 2] * S[1, 2] - S[0, 1] * S[2, 2]
+    c = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
+    det = S[0, 0] * a + S[0, 1] * b + S[0, 2] * c
+    out[0, 0] = a / det
+    out[0, 1] = out[1, 0] = b / det
+    out[0, 2] = out[2, 0] = c / det
+    out[1, 1] = (S[0, 0] * S[2, 2] - S[0, 2] * S[0, 2]) / det
+    out[1, 2] = out[2, 1] = (S[0, 1] * S[0, 2] - S[0, 0] * S[1, 2]) / det
+    out[2, 2] = (S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]) / det
+    return det
+
+
+@rule
+def _squared(S_inverse, d):  # type: ignore[no-untyped-def]
+    """Return dᵀ S⁻¹ d."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += d[i] * S_inverse[i, j] * d[j]
+    return total
+
+
+@rule
+def _drift(P, dt, density):  # type: ignore[no-untyped-def]
+    """Predict the (6, 6) covariance of a value and its rate: F P Fᵀ + Q, with white noise on the rate's rate."""
+    for i in range(3):
+        for j in range(3):
+            P[i, j] += dt * (P[i, 3 + j] + P[3 + i, j]) + dt * dt * P[3 + i, 3 + j]
+    for i in range(3):
+        for j in range(3):
+            P[i, 3 + j] += dt * P[3 + i, 3 + j]
+    for i in range(3):
+        P[i, i] += density * dt * dt * dt / 3.0
+        P[i, 3 + i] += density * dt * dt / 2.0
+        P[3 + i, 3 + i] += density * dt
+        for j in range(3):
+            P[3 + j, i] = P[i, 3 + j]
+
+
+@rule
+def _exchange(x, P, still, moving):  # type: ignore[no-untyped-def]
+    """Let each of the two models begin from a mixture: of its own state by the share given, else of the other's."""
+    for a in range(6):
+        for b in range(a, 6):
+            apart = (x[0, a] - x[1, a]) * (x[0, b] - x[1, b])
+            p, r = P[0, a, b], P[1, a, b]
+            P[0, a, b] = P[0, b, a] = still * p + (1.0 - still) * r + still * (1.0 - still) * apart
+            P[1, a, b] = P[1, b, a] = moving * r + (1.0 - moving) * p + moving * (1.0 - moving) * apart
+    for a in range(6):
+        u, v = x[0, a], x[1, a]
+        x[0, a] = still * u + (1.0 - still) * v
+        x[1, a] = moving * v + (1.0 - moving) * u
+
+
+@rule
+def _correct(P, S, S_inverse, d, gain, step):  # type: ignore[no-untyped-def]
+    """Kalman update for a measured (3,) difference ``d`` of covariance ``S``.
+
+    What is to be added to the state goes to ``step``. The (6, 6) ``P`` becomes P - K S Kᵀ, symmetric to the last bit.
+    """
+    for i in range(6):
+        for j in range(3):
+            gain[i, j] = P[i, 0] * S_inverse[0, j] + P[i, 1] * S_inverse[1, j] + P[i, 2] * S_inverse[2, j]
+        step[i] = gain[i, 0] * d[0] + gain[i, 1] * d[1] + gain[i, 2] * d[2]
+    for i in range(6):
+        for j in range(i, 6):
+            known = 0.0
+            for a in range(3):
+                for b in range(3):
+                    known += gain[i, a] * S[a, b] * gain[j, b]
+            P[i, j] -= known
+            P[j, i] = P[i, j]
+
+
+@rule
+def _turn(vector, out):  # type: ignore[no-untyped-def]
+    """Write the quaternion of the rotation vector in the first three of ``vector`` [rad] to ``out``."""
+    x, y, z = vector[0], vector[1], vector[2]
+    angle = np.sqrt(x * x + y * y + z * z)
+    scale = np.sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
+    out[0], out[1], out[2], out[3] = scale * x, scale * y, scale * z, np.cos(0.5 * angle)
+
+
+@rule
+def _compose(a, b, out):  # type: ignore[no-untyped-def]
+    """Write the quaternion product a b, of length 1, to ``out``."""
+    x = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
+    y = a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0]
+    z = a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3]
+    w = a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]
+    length = np.sqrt(x * x + y * y + z * z + w * w)
+    out[0], out[1], out[2], out[3] = x / length, y / length, z / length, w / length
+
+
+@rule
+def _between(a, b, out):  # type: ignore[no-untyped-def]
+    """Write the rotation vector d of b = a exp(d), at most pi long, to ``out``."""
+    x = a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1]
+    y = a[3] * b[1] + a[0] * b[2] - a[1] * b[3] - a[2] * b[0]
+    z = a[3] * b[2] - a[0] * b[1] + a[1] * b[0] - a[2] * b[3]
+    w = a[3] * b[3] + a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    if w < 0.0:
+        x, y, z, w = -x, -y, -z, -w
+    half_sine = np.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * np.arctan2(half_sine, w) / half_sine if half_sine > 1e-9 else 2.0
+    out[0], out[1], out[2] = scale * x, scale * y, scale * z
+
+
+@rule
+def _rotated(q, a, b):  # type: ignore[no-untyped-def]
+    """Return the entry a, b of the rotation matrix of the quaternion ``q``."""
+    if a == b:
+        return 1.0 - 2.0 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] - q[a] * q[a])
+    turn = q[3] * q[3 - a - b]
+    return 2.0 * (q[a] * q[b] + (turn if (b - a) % 3 == 2 else -turn))
+
+
+@rule
+def _new_axes(C, q, half):  # type: ignore[no-untyped-def]
+    """Write the covariance of a turn, in axes that have moved on by the quaternion ``q``, over the first of ``C``."""
+    for i in range(3):
+        for j in range(6):
+            half[i, j] = 0.0
+            for k in range(3):
+                half[i, j] += _rotated(q, k, i) * C[k, j]
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = (
+                half[i, 0] * _rotated(q, 0, j)
+                + half[i, 1] * _rotated(q, 1, j)
+                + half[i, 2] * _rotated(q, 2, j)
+            )
+            C[i, 3 + j] = C[3 + j, i] = half[i, 3 + j]
+
+
+# ------------------------------------------------------------------------------------------------------------- kernels
+
+
+@kernel
+def predict_places(x, P, weight, dt, still_s, moving_s, wander, density):  # type: ignore[no-untyped-def]
+    """Mix the models and predict each by ``dt`` seconds, in place.
+
+    ``still_s`` and ``moving_s`` are the mean times between a change of model [s], ``wander`` the variance that a still
+    position gains a second [m²/s], ``density`` that of the white acceleration [m²/s³].
+    """
+    rises, halts = 1.0 - np.exp(-dt / still_s), 1.0 - np.exp(-dt / moving_s)
+    for n in range(x.shape[0]):
+        rested, moved = weight[n, STILL], weight[n, MOVING]
+        weight[n, STILL] = rested * (1.0 - rises) + moved * halts
+        weight[n, MOVING] = rested * rises + moved * (1.0 - halts)
+        still = rested * (1.0 - rises) / weight[n, STILL]  # share of those that rest now that rested before
+        moving = moved * (1.0 - halts) / weight[n, MOVING]
+        _exchange(x[n], P[n], still, moving)
+        for a in range(3):
+            x[n, STILL, 3 + a] = 0.0
+            x[n, MOVING, a] += dt * x[n, MOVING, 3 + a]
+            for b in range(6):
+                P[n, STILL, 3 + a, b] = P[n, STILL, b, 3 + a] = 0.0
+            P[n, STILL, 3 + a, 3 + a] = STILL_SPEED_M_S * STILL_SPEED_M_S
+            P[n, STILL, a, a] += wander * dt
+        _drift(P[n, MOVING], dt, density)
+
+
+@kernel
+def predict_turns(q, rate, C, dt, density):  # type: ignore[no-untyped-def]
+    """Predict orientations by ``dt`` seconds, in place; ``density`` [rad²/s³] is that of white turn acceleration."""
+    step, half, angle = np.empty(4), np.empty((3, 6)), np.empty(3)
+    for n in range(q.shape[0]):
+        if np.isnan(q[n, 3]):
+            continue
+        for a in range(3):
+            angle[a] = dt * rate[n, a]
+        _turn(angle, step)
+        _compose(q[n], step, q[n])
+        _new_axes(C[n], step, half)
+        _drift(C[n], dt, density)
+
+
+@kernel
+def combine(x, P, weight, mean, cov):  # type: ignore[no-untyped-def]
+    """Write the mean (N, 6) and the covariance (N, 6, 6) of both models together."""
+    for n in range(x.shape[0]):
+        still, moving = weight[n, STILL], weight[n, MOVING]
+        for a in range(6):
+            mean[n, a] = still * x[n, 0, a] + moving * x[n, 1, a]
+            for b in range(6):
+                apart = (x[n, 0, a] - x[n, 1, a]) * (x[n, 0, b] - x[n, 1, b])
+                cov[n, a, b] = still * P[n, 0, a, b] + moving * P[n, 1, a, b] + still * moving * apart
+
+
+@kernel
+def compare(mean, cov, centres, R, squared, log_det):  # type: ignore[no-untyped-def]
+    """Write the squared Mahalanobis distance (N, M) of each of M measured ``centres`` to each track, and ln det S."""
+    S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for n in range(mean.shape[0]):
+        for m in range(centres.shape[0]):
+            for a in range(3):
+                d[a] = centres[m, a] - mean[n, a]
+                for b in range(3):
+                    S[a, b] = cov[n, a, b] + R[m, a, b]
+            log_det[n, m] = np.log(_invert(S, S_inverse))
+            squared[n, m] = _squared(S_inverse, d)
+
+
+@kernel
+def correct_places(x, P, weight, tracks, heads, centres, R):  # type: ignore[no-untyped-def]
+    """Update the tracks with index ``tracks`` (K,) by the measured centres with index ``heads`` (K,), in place."""
+    S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    gain, step, fit = np.empty((6, 3)), np.empty(6), np.empty(2)
+    for k in range(tracks.shape[0]):
+        n, m = tracks[k], heads[k]
+        for i in range(2):
+            for a in range(3):
+                d[a] = centres[m, a] - x[n, i, a]
+                for b in range(3):
+                    S[a, b] = P[n, i, a, b] + R[m, a, b]
+            det = _invert(S, S_inverse)
+            fit[i] = -0.5 * (_squared(S_inverse, d) + np.log(det))
+            _correct(P[n, i], S, S_inverse, d, gain, step)
+            for a in range(6):
+                x[n, i, a] += step[a]
+        best = max(fit[0], fit[1])
+        still, moving = weight[n, STILL] * np.exp(fit[0] - best), weight[n, MOVING] * np.exp(fit[1] - best)
+        weight[n, STILL] = min(max(still / (still + moving), LEAST_WEIGHT), 1.0 - LEAST_WEIGHT)
+        weight[n, MOVING] = 1.0 - weight[n, STILL]
+
+
+@kernel
+def correct_turns(q, rate, C, rejected, tracks, heads, measured, R, gate):  # type: ignore[no-untyped-def]
+    """Update orientations by the ``measured`` quaternions, in place; rows of NaN are passed over.
+
+    One that lies farther than ``gate`` (squared Mahalanobis distance) is taken for a flip and left out. After
+    ``REJECTED_BEFORE_RESET`` of those in a row it is the track that is wrong, and it starts anew from the last.
+    """
+    S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    gain, step, small = np.empty((6, 3)), np.empty(6), np.empty(4)
+    for k in range(tracks.shape[0]):
+        n, m = tracks[k], heads[k]
+        if np.isnan(measured[m, 3]):
+            continue
+        start = np.isnan(q[n, 3])
+        if not start:
+            _between(q[n], measured[m], d)
+            for a in range(3):
+                for b in range(3):
+                    S[a, b] = C[n, a, b] + R[m, a, b]
+            _invert(S, S_inverse)
+            if _squared(S_inverse, d) > gate:
+                rejected[n] += 1
+                start = rejected[n] >= REJECTED_BEFORE_RESET
+                if not start:
+                    continue
+        rejected[n] = 0
+        if start:
+            for a in range(3):
+                q[n, a] = measured[m, a]
+                rate[n, a] = 0.0
+                for b in range(3):
+                    C[n, a, b] = R[m, a, b]
+                    C[n, a, 3 + b] = C[n, 3 + b, a] = C[n, 3 + a, 3 + b] = 0.0
+                C[n, 3 + a, 3 + a] = FIRST_RATE_RAD_S * FIRST_RATE_RAD_S
+            q[n, 3] = measured[m, 3]
+            continue
+        _correct(C[n], S, S_inverse, d, gain, step)
+        _turn(step, small)
+        _compose(q[n], small, q[n])
+        for a in range(3):
+            rate[n, a] += step[3 + a]

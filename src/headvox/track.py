@@ -1,0 +1,366 @@
+"""From heads to tracks: who is who, where everybody is now, and how fast.
+
+A frame is five steps: predict, associate, correct, age, bear (:meth:`Tracker.update`). The filters are in
+``kalman.py``. What keeps a track alive is in :meth:`Tracker._age`: it dies fast where its place is seen to be empty,
+later where it is hidden.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from headvox.config import TrackerConfig
+from headvox.data import F64, I64, Cloud, Expected, Frame, Heads, State, Tracks
+from headvox.errors import HeadvoxError
+from headvox.kalman import (
+    FIRST_RATE_RAD_S,
+    FIRST_SPEED_M_S,
+    MOVING,
+    STILL,
+    STILL_SPEED_M_S,
+    combine,
+    compare,
+    correct_places,
+    correct_turns,
+    predict_places,
+    predict_turns,
+)
+from headvox.visibility import BEHIND, NO_RETURN, OUT_OF_VIEW, SEEN_EMPTY, SURFACE, see_places
+
+STILL_S, MOVING_S = 1.0, 2.0  # mean times that a head rests and moves
+WANDER_M2_S = 1e-6  # a head at rest sways by a millimetre in a second
+TURN_GATE = 16.3  # squared Mahalanobis distance: one in a thousand is farther
+FIRST_TURN_RAD = 0.35  # standard deviation of an orientation whose detector states none
+NEAR_M, WALK_M_S, FARTHEST_M = 0.35, 1.2, 1.2  # a head is never sought farther than this from its prediction
+BACK_M, BACK_HEIGHT_M, BACK_FARTHEST_M = 0.5, 0.12, 2.0  # nor farther than this from where it was lost
+LEAST_REACH_M, MOST_REACH_M = 0.12, 0.4  # about an expected place
+MOST_DRAIN = 0.5  # of its life a track loses in one frame, however long: one miss never ends it
+NOT_A_PAIR = 1e6
+
+TRACK = np.dtype(
+    [
+        ("id", np.int64),  # 0 until confirmed
+        ("born_ns", np.int64),
+        ("seen_ns", np.int64),
+        ("hits", np.int64),  # a bit a frame, the last frame lowest
+        ("life", np.float64),  # 1 when seen, dies at 0
+        ("lost", np.bool_),  # dead, but remembered
+        ("place", np.float64, 3),  # where it was last seen
+        ("radius", np.float64),
+        ("score", np.float64),
+        ("x", np.float64, (2, 6)),
+        ("P", np.float64, (2, 6, 6)),
+        ("weight", np.float64, 2),
+        ("q", np.float64, 4),
+        ("rate", np.float64, 3),
+        ("C", np.float64, (6, 6)),
+        ("rejected", np.int64),
+    ],
+    align=True,
+)
+Table = npt.NDArray[np.void]
+
+
+class Tracker:
+    """Follows heads from frame to frame. Ids begin at 1 with each tracker and are never used again by it.
+
+    >>> from headvox.data import Frame, Heads
+    >>> import numpy as np
+    >>> tracker = Tracker()
+    >>> for k in range(15):
+    ...     head = Heads(np.array([[0.0, 0.02 * k, 1.6]]), np.full((1, 4), np.nan), np.array([0.1]), np.array([5.0]))
+    ...     tracks = tracker.update(head, Frame(stamp_ns=k * 33_000_000))
+    >>> tracks.ids.tolist(), round(float(tracks.velocities[0, 1]), 1)
+    ([1], 0.6)
+
+    ``untracked`` counts the frames whose stamp did not go on: "repeated" (the same as the last), "late" (an earlier
+    one), and "resets" (time jumped back so far that everything began anew, see ``TrackerConfig.reset_s``).
+    """
+
+    def __init__(self, config: TrackerConfig | None = None) -> None:
+        self.config = config or TrackerConfig()
+        self.untracked: Counter[str] = Counter()
+        self.stamp_ns: int | None = None
+        """Of the last frame that was tracked."""
+        self._last_id = 0
+        self._table: Table = np.empty(0, TRACK)
+
+    # ------------------------------------------------------------------------------------------- the public calls
+
+    def update(self, heads: Heads, frame: Frame) -> Tracks:
+        """Take the heads found in ``frame``, and return every track at its stamp.
+
+        The images of the frame tell where a head that was not found may be hidden; a frame without any will do. A
+        frame whose stamp is not after the last one's is not tracked: its heads come back as tentative tracks.
+        """
+        if not self._is_next(frame.stamp_ns):
+            return _tentative(heads, frame.stamp_ns)
+        R_centre, R_turn = measurement_noise(heads, frame)
+        dt = self._predict(frame.stamp_ns)
+        tracks, found = self._associate(heads, R_centre)
+        self._correct(heads, R_centre, R_turn, tracks, found)
+        self._age(frame, dt, tracks, heads.sure[found])
+        new = heads.sure.copy()
+        new[found] = False
+        self._bear(heads, R_centre, R_turn, np.flatnonzero(new))
+        return self._report(self._table, frame.stamp_ns)
+
+    def predict(self, stamp_ns: int) -> Tracks:
+        """Return where the tracks will be at a stamp that is not before the last frame's; nothing is changed.
+
+        Raises:
+            HeadvoxError: an earlier stamp.
+        """
+        if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
+            raise HeadvoxError(
+                f"Expected a stamp from {self.stamp_ns} ns on, the last frame's, got {stamp_ns} ns.",
+                "Ask for the present or the future.",
+            )
+        return self._report(self._predicted(stamp_ns), stamp_ns)
+
+    def expected(self, stamp_ns: int) -> Expected:
+        """Return where confirmed heads are expected at ``stamp_ns``, for :meth:`Detector.detect_frame`."""
+        if self.stamp_ns is None or stamp_ns < self.stamp_ns:
+            return Expected(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
+        table = self._predicted(stamp_ns)
+        table = table[(table["id"] > 0) & ~table["lost"]]
+        mean, cov = _combined(table)
+        widest = np.sqrt(np.trace(cov[:, :3, :3], axis1=1, axis2=2))
+        return Expected(mean[:, :3], table["q"].copy(), np.clip(3.0 * widest, LEAST_REACH_M, MOST_REACH_M))
+
+    @property
+    def ids_given(self) -> int:
+        """How many heads were confirmed so far."""
+        return self._last_id
+
+    # -------------------------------------------------------------------------------------------------- the steps
+
+    def _is_next(self, stamp_ns: int) -> bool:
+        """Whether time goes on; counts where it does not, and starts anew when it jumped back far."""
+        if self.stamp_ns is not None and stamp_ns <= self.stamp_ns:
+            if self.stamp_ns - stamp_ns <= self.config.reset_s * 1e9:
+                self.untracked["repeated" if stamp_ns == self.stamp_ns else "late"] += 1
+                return False
+            self.untracked["resets"] += 1
+            self._table = np.empty(0, TRACK)
+            self.stamp_ns = None
+        return True
+
+    def _predict(self, stamp_ns: int) -> float:
+        """Move every track on to ``stamp_ns``; return the seconds since the last frame."""
+        dt = 0.0 if self.stamp_ns is None else (stamp_ns - self.stamp_ns) * 1e-9
+        self.stamp_ns = stamp_ns
+        self._table = self._table[stamp_ns - self._table["seen_ns"] <= self._longest_s() * 1e9]
+        self._table["hits"] = (self._table["hits"] << 1) & (2**self.config.confirm_frames - 1)
+        self._move(self._table, dt)
+        return dt
+
+    def _associate(self, heads: Heads, R: F64) -> tuple[I64, I64]:
+        """Return the pairs of tracks and heads, by index, that are likeliest as a whole."""
+        table = self._table
+        if len(table) == 0 or len(heads) == 0:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        mean, cov = _combined(table)
+        squared, log_det = np.empty((2, len(table), len(heads)))
+        compare(mean, cov, heads.centres, R, squared, log_det)
+        far = np.linalg.norm(mean[:, None, :3] - heads.centres, axis=2)
+        unseen_s = (self._now() - table["seen_ns"]) * 1e-9
+        possible = squared <= self.config.gate_sigmas**2
+        possible &= far <= np.minimum(NEAR_M + WALK_M_S * unseen_s, FARTHEST_M)[:, None]
+        possible &= ~table["lost"][:, None]
+        possible &= (table["id"] > 0)[:, None] | heads.sure
+        tracks, found = linear_sum_assignment(np.where(possible, squared + log_det, NOT_A_PAIR))
+        paired = possible[tracks, found]
+        return tracks[paired], found[paired]
+
+    def _correct(self, heads: Heads, R_centre: F64, R_turn: F64, tracks: I64, found: I64) -> None:
+        table = self._table
+        correct_places(table["x"], table["P"], table["weight"], tracks, found, heads.centres, R_centre)
+        correct_turns(
+            table["q"], table["rate"], table["C"], table["rejected"], tracks, found, heads.quaternions, R_turn,
+            TURN_GATE,
+        )  # fmt: skip
+        table["seen_ns"][tracks] = self._now()
+        table["radius"][tracks] = heads.radii[found]
+        table["score"][tracks] = heads.scores[found]
+        table["place"][tracks] = heads.centres[found]
+        table["hits"][tracks] |= heads.sure[found]
+
+    def _age(self, frame: Frame, dt: float, tracks: I64, sure: npt.NDArray[np.bool_]) -> None:
+        """Let the tracks that were not surely seen lose life, by what the sensors saw of their places; end the dead."""
+        config, table = self.config, self._table
+        limit_s = np.full(len(table), np.inf)
+        missed = ~table["lost"]
+        missed[tracks] = False
+        if missed.any():
+            limits = np.empty(5)
+            limits[[OUT_OF_VIEW, NO_RETURN, SURFACE]] = config.out_of_view_s, config.missed_s, config.missed_s
+            limits[[BEHIND, SEEN_EMPTY]] = config.hidden_s, config.empty_s
+            mean, _ = _combined(table[missed])
+            limit_s[missed] = limits[look_for(frame, mean[:, :3], config.sight_m)]
+        limit_s[tracks[~sure]] = config.weak_s
+        table["life"] -= np.minimum(dt / limit_s, MOST_DRAIN)
+        table["life"][tracks[sure]] = 1.0
+        dead = (table["life"] <= 0.0) & ~table["lost"]
+        table["lost"] |= dead
+        self._table = table[~(dead & (table["id"] == 0)) & self._may_be_confirmed()]
+
+    def _may_be_confirmed(self) -> npt.NDArray[np.bool_]:
+        """Confirm what was seen often enough; return False for what can no longer be."""
+        table, config = self._table, self.config
+        seen = sum((table["hits"] >> k) & 1 for k in range(config.confirm_frames))
+        for n in np.flatnonzero((table["id"] == 0) & (seen >= config.confirm_hits)):
+            table["id"][n] = self._identify(int(n))
+        return (table["id"] > 0) | (table["hits"] > 0)
+
+    def _identify(self, n: int) -> int:
+        """Return the id of the lost head that the new track ``n`` is, or else a new id."""
+        table = self._table
+        lost = np.flatnonzero(table["lost"] & (table["id"] > 0))
+        if len(lost):
+            unseen_s = (table["born_ns"][n] - table["seen_ns"][lost]) * 1e-9
+            away = table["place"][n] - table["place"][lost]
+            reach = np.minimum(BACK_M + WALK_M_S * unseen_s, BACK_FARTHEST_M)
+            unlike = np.hypot(away[:, 0], away[:, 1]) / reach
+            unlike = np.maximum(unlike, np.abs(away[:, 2]) / BACK_HEIGHT_M)
+            unlike[unseen_s < 0.0] = np.inf
+            best = int(np.argmin(unlike))
+            if unlike[best] <= 1.0:
+                table["hits"][lost[best]] = 0
+                known = int(table["id"][lost[best]])
+                table["id"][lost[best]] = 0  # dies now: its head goes on as the new track
+                table["born_ns"][n] = table["born_ns"][lost[best]]
+                return known
+        self._last_id += 1
+        return self._last_id
+
+    def _bear(self, heads: Heads, R_centre: F64, R_turn: F64, new: I64) -> None:
+        """Begin a track for each head of index ``new``."""
+        born: Table = np.zeros(len(new), TRACK)
+        born["born_ns"] = born["seen_ns"] = self._now()
+        born["hits"], born["life"] = 1, 1.0
+        born["place"] = heads.centres[new]
+        born["radius"], born["score"] = heads.radii[new], heads.scores[new]
+        born["x"][:, :, :3] = heads.centres[new, None]
+        born["P"][:, :, :3, :3] = R_centre[new, None]
+        born["P"][:, MOVING, 3:, 3:] = FIRST_SPEED_M_S**2 * np.eye(3)
+        born["P"][:, STILL, 3:, 3:] = STILL_SPEED_M_S**2 * np.eye(3)
+        born["weight"] = 0.5
+        born["q"] = heads.quaternions[new]
+        born["C"][:, :3, :3] = R_turn[new]
+        born["C"][:, 3:, 3:] = FIRST_RATE_RAD_S**2 * np.eye(3)
+        self._table = np.concatenate([self._table, born])
+        if self.config.confirm_hits == 1:
+            self._may_be_confirmed()
+
+    # ---------------------------------------------------------------------------------------------------- the rest
+
+    def _now(self) -> int:
+        assert self.stamp_ns is not None
+        return self.stamp_ns
+
+    def _longest_s(self) -> float:
+        """How long any track may be unseen and still be something."""
+        config = self.config
+        return max(config.remember_s, config.hidden_s, config.missed_s, config.out_of_view_s, config.empty_s)
+
+    def _move(self, table: Table, dt: float) -> None:
+        config = self.config
+        density, turn_density = config.speed_change_m_s**2, np.radians(config.turn_change_deg_s) ** 2
+        predict_places(table["x"], table["P"], table["weight"], dt, STILL_S, MOVING_S, WANDER_M2_S, density)
+        predict_turns(table["q"], table["rate"], table["C"], dt, turn_density)
+
+    def _predicted(self, stamp_ns: int) -> Table:
+        table = self._table.copy()
+        if self.stamp_ns is not None:
+            self._move(table, (stamp_ns - self.stamp_ns) * 1e-9)
+        return table
+
+    def _report(self, table: Table, stamp_ns: int) -> Tracks:
+        """Return the living rows of ``table`` as tracks, those with an id first."""
+        table = table[~table["lost"]]
+        table = table[
+            np.argsort(np.where(table["id"] > 0, table["id"], np.iinfo(np.int64).max), kind="stable")
+        ]
+        mean, cov = _combined(table)
+        unseen_s = (stamp_ns - table["seen_ns"]) * 1e-9
+        states = np.where(table["seen_ns"] == self.stamp_ns, State.CONFIRMED, State.COASTING)
+        states[table["id"] == 0] = State.TENTATIVE
+        unknown = np.isnan(table["q"][:, 3])
+        rates, turns = table["rate"].copy(), table["C"][:, :3, :3].copy()
+        rates[unknown], turns[unknown] = np.nan, np.nan
+        return Tracks(
+            stamp_ns, table["id"].copy(), states, mean[:, :3], mean[:, 3:], table["q"].copy(), rates,
+            table["radius"].copy(), table["score"].copy(), cov, turns,
+            (stamp_ns - table["born_ns"]) * 1e-9, unseen_s,
+        )  # fmt: skip
+
+
+def _combined(table: Table) -> tuple[F64, F64]:
+    """Return mean (N, 6) and covariance (N, 6, 6) of position and velocity."""
+    mean, cov = np.empty((len(table), 6)), np.empty((len(table), 6, 6))
+    combine(table["x"], table["P"], table["weight"], mean, cov)
+    return mean, cov
+
+
+def measurement_noise(heads: Heads, frame: Frame) -> tuple[F64, F64]:
+    """Return the covariances of centres [m²] and orientations [rad²], both (N, 3, 3): the detector's, or a guess.
+
+    The guess for a centre grows with the square of the distance from the nearest sensor, as the noise of a depth
+    camera does.
+    """
+    R_centre, R_turn = heads.centre_covariances, heads.rotation_covariances
+    unknown = np.isnan(R_centre[:, 0, 0])
+    if unknown.any():
+        places = [T[:3, 3] for T in _sensor_poses(frame)]
+        away = np.linalg.norm(heads.centres[:, None] - np.reshape(places, (-1, 3)), axis=2)
+        nearest = away.min(axis=1, initial=2.0 if not places else np.inf)
+        sigma = 0.003 + 0.002 * nearest**2
+        R_centre = np.where(unknown[:, None, None], sigma[:, None, None] ** 2 * np.eye(3), R_centre)
+    unknown = np.isnan(R_turn[:, 0, 0])
+    if unknown.any():
+        R_turn = np.where(unknown[:, None, None], FIRST_TURN_RAD**2 * np.eye(3), R_turn)
+    return np.ascontiguousarray(R_centre), np.ascontiguousarray(R_turn)
+
+
+def _sensor_poses(frame: Frame) -> list[F64]:
+    poses = [image.T_world_camera for image in frame.depths]
+    return poses + [cloud.T_world_sensor for cloud in frame.clouds if cloud.T_world_sensor is not None]
+
+
+def look_for(frame: Frame, places: F64, sight_m: float) -> I64:
+    """Return what the sensors saw of each of ``places`` (N, 3), see :func:`headvox.visibility.see_places`.
+
+    Clouds do not tell which rays came back empty: near their sensor they count as NO_RETURN, and everywhere when nobody
+    knows where that stood. So does a frame without any reading.
+    """
+    states = see_places(frame.depths, places, sight_m)
+    if frame.depths and not frame.clouds:
+        return states
+    near = np.ones(len(places), np.bool_)
+    if frame.clouds and all(cloud.T_world_sensor is not None for cloud in frame.clouds):
+        origins = [_origin(cloud) for cloud in frame.clouds]
+        near = (np.linalg.norm(places[:, None] - np.array(origins), axis=2) <= sight_m).any(axis=1)
+    states[near] = np.maximum(states[near], NO_RETURN)
+    return states
+
+
+def _origin(cloud: Cloud) -> F64:
+    assert cloud.T_world_sensor is not None
+    return cloud.T_world_sensor[:3, 3]
+
+
+def _tentative(heads: Heads, stamp_ns: int) -> Tracks:
+    """Return bare detections as tracks without id and history."""
+    count = len(heads)
+    covariances = np.full((count, 6, 6), np.nan)
+    covariances[:, :3, :3] = heads.centre_covariances
+    none, nothing = np.zeros(count, np.int64), np.full((count, 3), np.nan)
+    return Tracks(
+        stamp_ns, none, np.full(count, State.TENTATIVE, np.int64), heads.centres, nothing, heads.quaternions, nothing,
+        heads.radii, heads.scores, covariances, heads.rotation_covariances, np.zeros(count), np.zeros(count),
+    )  # fmt: skip

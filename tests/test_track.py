@@ -1,0 +1,354 @@
+"""Who is who over time: births, deaths, occlusion, time stamps, identities."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import scenes
+
+from headvox.config import TrackerConfig
+from headvox.data import Cloud, DepthImage, Frame, Heads, Intrinsics, State, Tracks
+from headvox.errors import HeadvoxError
+from headvox.track import Tracker, measurement_noise
+
+MS = 1_000_000
+RATE_MS = 100
+
+
+def heads(*centres, sure=True, score=5.0) -> Heads:
+    n = len(centres)
+    return Heads(
+        np.array(centres, np.float64).reshape(n, 3),
+        np.full((n, 4), np.nan),
+        np.full(n, 0.1),
+        np.full(n, score),
+        sure=np.full(n, sure),
+    )
+
+
+def at(step: float) -> Frame:
+    return Frame(round(step * RATE_MS) * MS)
+
+
+def follow(tracker: Tracker, path, first: int = 0) -> Tracks:
+    """Feed a head at each of ``path``, None where it is not seen; return the last tracks."""
+    for k, centre in enumerate(path, first):
+        tracks = tracker.update(heads() if centre is None else heads(centre), at(k))
+    return tracks
+
+
+STANDING = [(1.0, 0.5, 1.6)]
+
+
+def walk(steps: int, first: int = 0, speed=(0.8, 0.3)) -> list[tuple[float, float, float]]:
+    return [(speed[0] * 0.1 * k, speed[1] * 0.1 * k, 1.6) for k in range(first, first + steps)]
+
+
+# ------------------------------------------------------------------------------------------------------ births and ids
+
+
+def test_a_head_gets_an_id_after_so_many_sightings_of_so_many_frames() -> None:
+    tracker = Tracker(TrackerConfig(confirm_hits=3, confirm_frames=5))
+    states = []
+    for k, seen in enumerate((True, False, True, False, True)):
+        tracks = follow(tracker, STANDING if seen else [None], k)
+        states += [(int(tracks.ids[0]), State(tracks.states[0]).name)]
+    assert states[:4] == [(0, "TENTATIVE")] * 4
+    assert states[4] == (1, "CONFIRMED")
+
+
+def test_a_flicker_gets_no_id_and_goes() -> None:
+    tracker = Tracker()
+    assert len(follow(tracker, STANDING)) == 1
+    assert len(follow(tracker, [None] * 6, 1)) == 0
+    assert tracker.ids_given == 0
+
+
+def test_one_sighting_is_enough_when_one_is_asked_for() -> None:
+    tracks = Tracker(TrackerConfig(confirm_hits=1, confirm_frames=1)).update(heads(*STANDING), at(0))
+    assert tracks.ids.tolist() == [1]
+
+
+def test_ids_belong_to_the_tracker() -> None:
+    one, two = Tracker(), Tracker()
+    assert follow(one, STANDING * 3).ids.tolist() == [1]
+    assert follow(two, STANDING * 3).ids.tolist() == [1]
+    for k in range(3, 7):
+        tracks = one.update(heads(*STANDING, (-1.0, 0.0, 1.2)), at(k))
+    assert tracks.ids.tolist() == [1, 2]
+    assert two.ids_given == 1
+
+
+def test_two_who_cross_keep_their_ids() -> None:
+    tracker = Tracker()
+    for k in range(60):
+        left, right = (-2.4 + 0.08 * k, 0.12, 1.6), (2.4 - 0.08 * k, -0.12, 1.65)
+        tracks = tracker.update(heads(left, right), at(k))
+    assert tracks.ids.tolist() == [1, 2]
+    for k, place in enumerate((left, right)):
+        np.testing.assert_allclose(tracks.centres[k], place, atol=0.02)
+    assert tracker.ids_given == 2
+
+
+# ------------------------------------------------------------------------------------------------- motion and its state
+
+
+def test_a_walking_head_has_its_velocity_and_no_lag() -> None:
+    tracks = follow(Tracker(), walk(40))
+    np.testing.assert_allclose(tracks.velocities[0], [0.8, 0.3, 0.0], atol=0.02)
+    np.testing.assert_allclose(tracks.centres[0], walk(40)[-1], atol=0.005)
+    assert tracks.ages_s[0] == pytest.approx(3.9)
+    assert tracks.unseen_s[0] == 0.0
+
+
+def test_a_still_head_is_smoothed() -> None:
+    rng = np.random.default_rng(0)
+    tracker, centres = Tracker(), []
+    for k in range(300):
+        place = np.array([1.0, 0.5, 1.6]) + rng.normal(0.0, 0.006, 3)
+        centres.append(tracker.update(heads(tuple(place)), Frame(k * 33 * MS)).centres[0])
+    spread = np.std(centres[60:], axis=0)
+    assert spread.max() < 0.002
+    assert np.linalg.norm(np.mean(centres[60:], axis=0) - [1.0, 0.5, 1.6]) < 0.002
+
+
+def test_coasting_goes_on_along_the_path_and_is_told() -> None:
+    tracker = Tracker()
+    follow(tracker, walk(30))
+    tracks = follow(tracker, [None] * 4, 30)
+    assert State(tracks.states[0]) == State.COASTING
+    assert tracks.unseen_s[0] == pytest.approx(0.4)
+    np.testing.assert_allclose(tracks.centres[0], walk(1, 33)[0], atol=0.08)
+    tracks = follow(tracker, walk(1, 34), 34)
+    assert (tracks.ids.tolist(), tracks.states.tolist()) == ([1], [State.CONFIRMED])
+
+
+def test_covariance_grows_without_sight_and_shrinks_with_it() -> None:
+    tracker = Tracker()
+    follow(tracker, walk(30))
+    widths = [np.trace(follow(tracker, [None], 30 + k).covariances[0, :3, :3]) for k in range(5)]
+    assert (np.diff(widths) > 0).all()
+    assert np.trace(follow(tracker, walk(1, 35), 35).covariances[0, :3, :3]) < widths[0]
+
+
+def test_predict_is_for_a_planner_and_changes_nothing() -> None:
+    tracker = Tracker()
+    follow(tracker, walk(30))
+    ahead = tracker.predict(at(31).stamp_ns)
+    np.testing.assert_allclose(ahead.centres[0], walk(1, 31)[0], atol=0.04)
+    assert ahead.stamp_ns == at(31).stamp_ns
+    again = tracker.predict(at(29).stamp_ns)
+    np.testing.assert_allclose(again.centres[0], walk(1, 29)[0], atol=0.01)
+    assert State(again.states[0]) == State.CONFIRMED
+    with pytest.raises(HeadvoxError, match="last frame's"):
+        tracker.predict(at(28).stamp_ns)
+    assert len(Tracker().predict(5)) == 0
+
+
+# ----------------------------------------------------------------------------------------------------------- the clock
+
+
+def test_irregular_stamps_are_real_time() -> None:
+    rng = np.random.default_rng(2)
+    tracker, step = Tracker(), 0.0
+    for _ in range(60):
+        step += rng.uniform(0.2, 2.0)
+        tracks = tracker.update(heads((0.08 * step, 0.0, 1.6)), at(step))
+    np.testing.assert_allclose(tracks.velocities[0], [0.8, 0.0, 0.0], atol=0.03)
+    assert not tracker.untracked
+
+
+def test_repeated_and_late_frames_are_counted_and_change_nothing() -> None:
+    tracker = Tracker()
+    follow(tracker, STANDING * 10)
+    before = tracker.predict(at(9).stamp_ns)
+    for frame in (at(9), at(9), at(7)):
+        tracks = tracker.update(heads((1.3, 0.5, 1.6)), frame)
+        assert (tracks.ids.tolist(), tracks.states.tolist()) == ([0], [State.TENTATIVE])
+        assert tracks.stamp_ns == frame.stamp_ns
+        np.testing.assert_array_equal(tracks.centres, [[1.3, 0.5, 1.6]])
+    assert dict(tracker.untracked) == {"repeated": 2, "late": 1}
+    assert_same(tracker.predict(at(9).stamp_ns), before)
+
+
+def test_a_recording_that_begins_again_resets_but_never_repeats_an_id() -> None:
+    tracker = Tracker()
+    follow(tracker, STANDING * 30)
+    tracks = follow(tracker, STANDING * 3)
+    assert tracks.ids.tolist() == [2]
+    assert tracks.ages_s[0] == pytest.approx(0.2)
+    assert dict(tracker.untracked) == {"resets": 1}
+
+
+def test_after_a_long_gap_nobody_is_left() -> None:
+    tracker = Tracker()
+    follow(tracker, STANDING * 5)
+    tracks = tracker.update(heads(*STANDING), at(5 + 10 * TrackerConfig().remember_s + 1))
+    assert tracks.states.tolist() == [State.TENTATIVE]
+
+
+def test_slow_frames_are_tracked_too() -> None:
+    """Two frames a second: one miss is longer than most limits, and ends nobody."""
+    tracker = Tracker()
+    for k in range(20):
+        seen = heads() if k in (8, 13) else heads((0.2 * k, 0.0, 1.6))
+        tracks = tracker.update(seen, at(5 * k))
+    assert tracks.ids.tolist() == [1]
+
+
+# ------------------------------------------------------------------------------------------ what the sensors saw there
+
+CAMERA = Intrinsics(80, 60, 60.0, 60.0, 39.5, 29.5)
+LOOKING = scenes.looking_along_x(0.0, 0.0, 1.6)
+PLACE = (2.0, 0.0, 1.6)
+
+
+def image(depth_m: float, camera: Intrinsics = CAMERA, T: np.ndarray = LOOKING) -> DepthImage:
+    depth = np.full((camera.height, camera.width), round(1000 * depth_m), np.uint16)
+    return DepthImage("front", depth, camera, T)
+
+
+def lives(*images: DepthImage, clouds=(), place=PLACE) -> float:
+    """Return how many seconds a standing head is still followed after it was last seen."""
+    tracker = Tracker()
+    for k in range(10):
+        tracker.update(heads(place), Frame(k * 20 * MS, depths=images, clouds=clouds))
+    for k in range(10, 400):
+        tracks = tracker.update(heads(), Frame(k * 20 * MS, depths=images, clouds=clouds))
+        if len(tracks) == 0:
+            return (k - 9) * 0.02
+    return np.inf
+
+
+def test_what_is_seen_of_a_place_decides_how_long_a_track_lives() -> None:
+    config = TrackerConfig()
+    close = 0.021  # a frame, and rounding
+    assert lives(image(4.0)) == pytest.approx(config.empty_s, abs=close)
+    assert lives(image(1.9)) == pytest.approx(config.missed_s, abs=close)  # something is there, but no head
+    assert lives(image(1.0)) == pytest.approx(config.hidden_s, abs=close)
+    assert lives(image(0.0)) == pytest.approx(config.missed_s, abs=close)  # hair without returns is not empty
+    turned = scenes.looking_along_x(3.0, 0.0, 1.6)  # the place is behind the camera
+    assert lives(image(4.0, T=turned)) == pytest.approx(config.out_of_view_s, abs=close)
+    beyond = (config.sight_m + 1.0, 0.0, 1.6)
+    assert lives(image(2.0), place=beyond) == pytest.approx(config.out_of_view_s, abs=close)
+
+
+def test_of_two_cameras_the_one_that_sees_the_place_empty_decides() -> None:
+    config = TrackerConfig()
+    turned = scenes.looking_along_x(3.0, 0.0, 1.6)
+    assert lives(image(1.0), image(4.0)) == pytest.approx(config.empty_s, abs=0.021)
+    assert lives(image(4.0, T=turned), image(1.0)) == pytest.approx(config.hidden_s, abs=0.021)
+
+
+def test_clouds_tell_only_how_far_their_sensor_is() -> None:
+    config, points = TrackerConfig(), np.zeros((1, 3), np.float32)
+    near, far = np.eye(4), scenes.looking_along_x(20.0, 0.0, 0.0)
+    for T, limit in ((None, config.missed_s), (near, config.missed_s), (far, config.out_of_view_s)):
+        assert lives(clouds=(Cloud("lidar", points, T),)) == pytest.approx(limit, abs=0.021)
+
+
+# ----------------------------------------------------------------------------------------------------- weak heads
+
+
+def test_weak_heads_bear_nobody_and_keep_nobody_for_long() -> None:
+    tracker = Tracker()
+    for k in range(10):
+        assert len(tracker.update(heads(*STANDING, sure=False), at(k))) == 0
+    follow(tracker, STANDING * 5, 10)
+    steps = 0
+    while len(tracker.update(heads(*STANDING, sure=False), at(15 + steps))):
+        steps += 1
+    assert steps * 0.1 == pytest.approx(TrackerConfig().weak_s, abs=0.11)
+
+
+def test_weak_heads_between_sure_ones_hold_a_track() -> None:
+    tracker = Tracker()
+    follow(tracker, walk(10))
+    for k in range(10, 60):
+        tracks = tracker.update(heads(*walk(1, k), sure=k % 10 == 0), at(k))
+        assert (tracks.ids.tolist(), tracks.states.tolist()) == ([1], [State.CONFIRMED])
+
+
+def test_what_is_expected_is_where_confirmed_heads_will_be() -> None:
+    tracker = Tracker()
+    assert len(tracker.expected(0)) == 0
+    follow(tracker, walk(2))
+    assert len(tracker.expected(at(2).stamp_ns)) == 0
+    follow(tracker, walk(20, 2), 2)
+    expected = tracker.expected(at(22).stamp_ns)
+    np.testing.assert_allclose(expected.centres, [walk(1, 22)[0]], atol=0.02)
+    assert 0.1 < expected.reaches_m[0] <= 0.4
+    assert len(tracker.expected(at(3).stamp_ns)) == 0  # a late frame is not tracked
+
+
+# ------------------------------------------------------------------------------------------------------ lost and found
+
+
+def test_a_head_that_comes_back_is_the_same_one() -> None:
+    tracker = Tracker()
+    follow(tracker, walk(20))
+    tracks = follow(tracker, [None] * 25, 20)
+    assert len(tracks) == 0
+    tracks = follow(tracker, walk(3, 40), 45)
+    assert tracks.ids.tolist() == [1]
+    assert tracks.ages_s[0] == pytest.approx(4.7)
+
+
+@pytest.mark.parametrize("place", [(1.52, 0.57, 1.2), (-1.6, 0.57, 1.6)])
+def test_a_head_of_another_height_or_far_away_is_another(place) -> None:
+    tracker = Tracker()
+    follow(tracker, walk(20))
+    follow(tracker, [None] * 25, 20)
+    assert follow(tracker, [place] * 3, 45).ids.tolist() == [2]
+
+
+def test_one_lost_head_is_given_to_one_only() -> None:
+    tracker = Tracker()
+    follow(tracker, STANDING * 10)
+    follow(tracker, [None] * 20, 10)
+    for k in range(30, 34):
+        tracks = tracker.update(heads((1.1, 0.5, 1.6), (0.6, 0.5, 1.6)), at(k))
+    assert sorted(tracks.ids.tolist()) == [1, 2]
+
+
+# ------------------------------------------------------------------------------------------------------------ the rest
+
+
+def test_noise_is_the_detectors_or_grows_with_distance() -> None:
+    camera = image(3.0)
+    known = replace(heads((1.0, 0.0, 1.6)), centre_covariances=np.eye(3)[None] * 1e-4)
+    assert measurement_noise(known, Frame(0))[0][0, 0, 0] == 1e-4
+    near, far = (
+        measurement_noise(heads((x, 0.0, 1.6)), Frame(0, depths=(camera,)))[0][0] for x in (1.0, 3.0)
+    )
+    assert np.sqrt(near[0, 0]) == pytest.approx(0.005)
+    assert np.sqrt(far[1, 1]) == pytest.approx(0.021)
+    assert np.isfinite(measurement_noise(heads((1.0, 0.0, 1.6)), Frame(0))[0]).all()
+
+
+def assert_same(a: Tracks, b: Tracks) -> None:
+    for field in fields(Tracks):
+        np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
+
+
+def test_the_same_heads_make_the_same_tracks() -> None:
+    def run() -> Tracks:
+        rng, tracker = np.random.default_rng(3), Tracker()
+        for k in range(80):
+            places = [(x, 0.02 * k * (-1) ** j, 1.6) for j, x in enumerate((-1.0, 0.0, 1.0, 2.0))]
+            seen = [tuple(np.array(p) + rng.normal(0, 0.01, 3)) for p in places if rng.random() < 0.8]
+            tracks = tracker.update(heads(*seen), at(k))
+        return tracks
+
+    assert_same(run(), run())
+
+
+def test_nothing_that_is_handed_out_changes_later() -> None:
+    tracker = Tracker()
+    tracks = follow(tracker, walk(10))
+    kept = {field.name: np.copy(getattr(tracks, field.name)) for field in fields(Tracks)}
+    follow(tracker, walk(10, 10), 10)
+    for name, value in kept.items():
+        np.testing.assert_array_equal(getattr(tracks, name), value)

@@ -134,7 +134,7 @@ def _forget_stdout() -> None:
 def _run(args: argparse.Namespace) -> int:
     config, tracker_config = config_of(args), tracker_config_of(args)
     if args.no_track and args.output is not None and args.output.suffix == ".tum":
-        raise _UsageError("-o NAME.tum writes a file a track: it does not go with --no-track")
+        raise UsageError("-o NAME.tum writes a file a track: it does not go with --no-track")
     from headvox.sinks import Sink, open_sink
     from headvox.sources import open_source
 
@@ -269,7 +269,7 @@ def tracker_config_of(args: argparse.Namespace) -> TrackerConfig:
     """Return the settings of the tracker, in the same way."""
     from headvox.config import TrackerConfig, load_tracker_config
 
-    return _with_flags(TrackerConfig() if args.config is None else loadtracker_config_of(args.config), args)
+    return _with_flags(TrackerConfig() if args.config is None else load_tracker_config(args.config), args)
 
 
 def _with_flags(config: Config, args: argparse.Namespace) -> Config:
@@ -338,6 +338,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
     run.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
     add_settings(run)
+    add_tracker_settings(run)
     run.usage = "%(prog)s [SOURCE] [--json] [-o OUT] [flags]"
 
     info = _command(commands, "info", _info, "tell what a source holds")
@@ -345,6 +346,7 @@ def _parser() -> argparse.ArgumentParser:
 
     config = _command(commands, "config", _show_config, "print the settings as TOML, as --config takes them")
     add_settings(config)
+    add_tracker_settings(config)
     config.usage = "%(prog)s [flags]"
 
     _command(commands, "warmup", _warmup, "compile every loop now, so that no first run has to wait")
@@ -416,6 +418,10 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--threads", type=whole_number, metavar="N", help="threads for a frame; the heads are the same"
     )
+
+
+def add_tracker_settings(parser: argparse.ArgumentParser) -> None:
+    """Add a flag for each setting of the tracker; :func:`add_settings` adds ``--config``."""
     tracker = parser.add_argument_group("settings of the tracker", "the same holds")
     for flag, name, kind, metavar, text in TRACKER_FLAGS:
         tracker.add_argument(flag, dest=name, type=kind, metavar=metavar, help=text)
@@ -455,27 +461,9 @@ def _either(names: Sequence[str]) -> str:
 TRACKER_FLAGS = (
     ("--confirm-hits", "confirm_hits", whole_number, "N", "a new head gets an id when it was seen in N ..."),
     ("--confirm-frames", "confirm_frames", whole_number, "N", "... of N frames in a row"),
-    (
-        "--gate-sigmas",
-        "gate_sigmas",
-        number,
-        "K",
-        "how far from its prediction a head is sought, in standard deviations",
-    ),
-    (
-        "--speed-change",
-        "speed_change_m_s",
-        number,
-        "M/S",
-        "how much the velocity of a moving head changes within a second",
-    ),
-    (
-        "--turn-change",
-        "turn_change_deg_s",
-        number,
-        "DEG/S",
-        "how much a head's turn rate changes within a second",
-    ),
+    ("--gate-sigmas", "gate_sigmas", number, "SIGMAS", "how far from its prediction a head is sought"),
+    ("--speed-change", "speed_change_m_s", number, "M/S", "how fast a moving head changes its velocity"),
+    ("--turn-change", "turn_change_deg_s", number, "DEG/S", "how fast a head changes its turn rate"),
     ("--empty", "empty_s", number, "S", "a track ends when its place is seen to be empty for so long"),
     ("--out-of-view", "out_of_view_s", number, "S", "... or is out of every sensor's view"),
     ("--missed", "missed_s", number, "S", "... or is in view, but nothing is found there"),

@@ -7,7 +7,7 @@ import scenes
 
 from headvox import Cloud, DepthImage, Detector, Frame, Heads, HeadvoxError, Intrinsics
 from headvox.config import DetectorConfig
-from headvox.data import BadFrame
+from headvox.data import BadFrame, Expected
 from headvox.fuse import Region
 from headvox.masks import load_cascade, parse_cascade
 
@@ -113,6 +113,42 @@ def test_without_refinement_a_head_is_at_its_voxel(make):
     assert len(heads) > 1
     steps = heads.centres / 0.05 - 0.5
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+
+
+def expecting(*centres, reach=0.2) -> Expected:
+    return Expected(
+        np.array(centres).reshape(-1, 3), np.full((len(centres), 4), np.nan), np.full(len(centres), reach)
+    )
+
+
+@pytest.mark.parametrize("frame", [Frame(0, clouds=(Cloud("c", two_busts()),)), camera_frame(0, 2)])
+def test_where_a_head_is_expected_a_weaker_one_lives_but_not_a_much_weaker_one(make, frame):
+    everyone = make(min_score=-2.0).detect_frame(frame)
+    best = everyone.centres[0]
+    above = float(everyone.scores[0]) + 0.5
+    detector = make(min_score=above, score_slack=0.6)
+    assert len(detector.detect_frame(frame)) == 0
+    heads = detector.detect_frame(frame, expecting(best))
+    assert (heads.scores[0], heads.sure[0]) == (everyone.scores[0], False)
+    np.testing.assert_array_equal(heads.centres[0], best)
+    assert (np.linalg.norm(heads.centres - best, axis=1) < 0.4).all()
+    assert len(detector.detect_frame(frame, expecting(best + np.array((0, 0, 0.5))))) == 0
+    assert len(detector.detect_frame(frame, expecting())) == 0
+    assert len(make(min_score=above, score_slack=0.4).detect_frame(frame, expecting(best))) == 0
+
+
+def test_expecting_a_head_takes_nothing_from_the_others(make):
+    """What is found without expecting anything is found with it, surely and bit for bit."""
+    frame = camera_frame(1, 2)
+    detector = make(min_score=-1.0)
+    bare = detector.detect_frame(frame)
+    expected = detector.detect_frame(frame, expecting((0.1, -0.15, 0.1), (0.9, 0.9, 0.0), reach=0.1))
+    assert len(bare) > 0
+    assert bare.sure.all()
+    sure = expected.sure
+    assert everything(bare) == tuple(
+        a[sure].tobytes() for a in (expected.centres, expected.quaternions, expected.radii, expected.scores)
+    )
 
 
 def test_heads_come_best_first_and_apart(make):

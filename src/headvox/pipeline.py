@@ -295,7 +295,7 @@ class Detector:
 
     def _is_expected(self, cells: I32, expected: Expected, memory: _Memory) -> npt.NDArray[np.bool_]:
         """Whether each of ``cells`` is within reach of any place where a head is expected."""
-        centres = memory.lattice.centres(cells + memory.longer[:3])
+        centres = memory.lattice.centres(cells + memory.first)
         away = np.linalg.norm(centres[:, None] - expected.centres, axis=2)
         within: npt.NDArray[np.bool_] = (away <= expected.reaches_m + memory.lattice.voxel_m).any(axis=1)
         return within

@@ -1,0 +1,103 @@
+"""The node ``head_detector``: depth images and clouds in, heads out."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from geometry_msgs.msg import PoseArray
+from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import MarkerArray
+
+from headvox.config import DetectorConfig
+from headvox.data import Frame
+from headvox.errors import HeadvoxError
+from headvox.masks import load_cascade
+from headvox.pipeline import Detector
+from headvox.warmup import warm_up
+from headvox_ros import outputs
+from headvox_ros.node import SensorNode, run
+from headvox_ros.parameters import Parameter, config_from, parameters_of
+from headvox_ros.synchronise import NS
+
+PARAMETERS = [
+    *parameters_of(DetectorConfig, "detector"),
+    Parameter(
+        "publish_tf", False, "Broadcast a frame head_ID for each head whose orientation is known.", None
+    ),
+    Parameter("marker_lifetime_s", 0.5, "How long a marker is shown when nothing new comes.", (0.0, 60.0)),
+]
+
+
+class HeadDetector(SensorNode):
+    """Finds heads in what depth cameras and LiDARs see, in process: no cloud leaves it."""
+
+    def __init__(self) -> None:
+        self._detector: Detector | None = None
+        super().__init__("head_detector", PARAMETERS)
+        qos = QoSProfile(depth=5)
+        self._poses = self.create_lifecycle_publisher(PoseArray, "~/poses", qos)
+        self._markers = self.create_lifecycle_publisher(MarkerArray, "~/markers", qos)
+        self._tracks = self.create_lifecycle_publisher(Odometry, "~/tracks", QoSProfile(depth=50))
+        self._heads = None
+        if outputs.vision is not None:
+            self._heads = self.create_lifecycle_publisher(outputs.vision.Detection3DArray, "~/heads", qos)
+        self._tf = self.create_lifecycle_publisher(TFMessage, "/tf", QoSProfile(depth=100))
+
+    def check(self, values: Mapping[str, Any]) -> None:
+        """Refuse settings that the detector refuses."""
+        load_cascade(config_from(values, "detector").cascade)
+        if not any(topic for name in ("clouds", "depths") for topic in values[name]):
+            raise HeadvoxError(
+                "There is no topic to listen to.",
+                "Set depths or clouds: -p depths:=\"['/camera/depth/image_rect_raw']\"",
+            )
+
+    def prepare(self) -> None:
+        """Make the detector, and compile its loops."""
+        config = config_from(self.values, "detector")
+        warm_up(config)
+        self._detector = Detector(config)
+        self._board = outputs.MarkerBoard(self.get_parameter("marker_lifetime_s").value)
+
+    def process(self, frame: Frame) -> None:
+        """Find the heads of a frame and publish them, with the frame's stamp."""
+        heads = outputs.bare(self._current_detector().detect_frame(frame))
+        header = Header(frame_id=self.get_parameter("target_frame").value)
+        header.stamp.sec, header.stamp.nanosec = divmod(frame.stamp_ns, NS)
+        if self._heads is not None:
+            self._heads.publish(outputs.detections(header, heads))
+        self._poses.publish(outputs.poses(header, heads))
+        self._markers.publish(self._board.show(header, heads))
+        for track in outputs.tracks(header, heads):
+            self._tracks.publish(track)
+        if self.get_parameter("publish_tf").value:
+            self._tf.publish(TFMessage(transforms=outputs.frames(header, heads)))
+
+    def _current_detector(self) -> Detector:
+        """Return the detector that the parameters ask for: another one when they were changed."""
+        assert self._detector is not None
+        config = config_from(self.values, "detector")
+        if config != self._detector.config:
+            self._detector.close()
+            self._detector = Detector(config)
+        return self._detector
+
+    def release(self) -> None:
+        """End the detector's threads."""
+        if self._detector is not None:
+            self._detector.close()
+            self._detector = None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node; return its exit code."""
+    return run(HeadDetector, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv))

@@ -1,0 +1,215 @@
+"""Nodes in processes of their own, and a robot in this one that knows nothing but standard messages."""
+
+from __future__ import annotations
+
+import array
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray, TransformStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import MarkerArray
+
+import headvox
+
+PACKAGE = Path(__file__).resolve().parents[2]
+NS = 1_000_000_000
+START_S = 60.0  # the first run of a new version compiles
+
+
+class Process:
+    """A node of the package, in a process of its own."""
+
+    def __init__(self, module: str, *parameters: str) -> None:
+        arguments = [part for parameter in parameters for part in ("-p", parameter)]
+        command = [sys.executable, "-m", f"headvox_ros.{module}", "--ros-args", *arguments]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def interrupt(self) -> None:
+        self.process.send_signal(signal.SIGINT)
+
+    def end(self) -> tuple[int, str]:
+        """Interrupt it, and return its exit code and everything that it said."""
+        if self.process.poll() is None:
+            self.interrupt()
+        return self.wait()
+
+    def wait(self, timeout_s: float = 60.0) -> tuple[int, str]:
+        try:
+            said, _ = self.process.communicate(timeout=timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            said, _ = self.process.communicate()
+            pytest.fail(f"it does not end; it said:\n{said}")
+        return self.process.returncode, said
+
+
+class Robot:
+    """Publishes what drivers publish, and keeps what comes back."""
+
+    def __init__(self) -> None:
+        self.node = rclpy.create_node("robot")
+        self.got: dict[str, list] = defaultdict(list)
+        self._out: dict[str, object] = {}
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._tf = self.node.create_publisher(TFMessage, "/tf", 100)
+        self._tf_static = self.node.create_publisher(TFMessage, "/tf_static", latched)
+        self.listen(DiagnosticArray, "/diagnostics")
+        self.listen(PoseArray, "/head_detector/poses")
+        self.listen(MarkerArray, "/head_detector/markers")
+
+    def listen(self, kind, topic: str, qos=10) -> None:
+        self.node.create_subscription(kind, topic, self.got[topic].append, qos)
+
+    def spin(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            rclpy.spin_once(self.node, timeout_sec=left)
+
+    def wait(self, happened, seconds: float = 15.0, meanwhile=None, every_s: float = 0.1):
+        """Spin until ``happened()`` is true, and return it; call ``meanwhile`` every so often."""
+        end = time.monotonic() + seconds
+        while not (result := happened()):
+            assert time.monotonic() < end, "it did not happen in time"
+            if meanwhile is not None:
+                meanwhile()
+            self.spin(every_s)
+        return result
+
+    def publish(self, topic: str, message) -> None:
+        kind = type(message)
+        if topic not in self._out:
+            self._out[topic] = self.node.create_publisher(kind, topic, QoSProfile(depth=2))
+            self.wait(lambda: self._out[topic].get_subscription_count() > 0, START_S)
+            self.spin(0.3)
+        self._out[topic].publish(message)
+
+    def place(self, child: str, T, stamp_ns: int = 0, parent: str = "world", static: bool = True) -> None:
+        moved = TransformStamped(header=header(parent, stamp_ns), child_frame_id=child)
+        t, q = moved.transform.translation, moved.transform.rotation
+        t.x, t.y, t.z = map(float, T[:3, 3])
+        q.x, q.y, q.z, q.w = map(float, Rotation.from_matrix(T[:3, :3]).as_quat())
+        (self._tf_static if static else self._tf).publish(TFMessage(transforms=[moved]))
+
+    def see(self, camera: str, image, stamp_ns: int, **changes) -> None:
+        """Publish a depth image with its camera_info, with some of its fields changed."""
+        lens = image.intrinsics
+        stamped = header(f"{camera}_optical", stamp_ns)
+        k = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
+        info = CameraInfo(header=stamped, width=lens.width, height=lens.height, k=k)
+        self.publish(f"/{camera}/camera_info", info)
+        height, width = image.depth.shape
+        message = Image(
+            header=stamped,
+            height=height,
+            width=width,
+            encoding="16UC1",
+            step=2 * width,
+            data=data_of(image.depth),
+        )
+        for name, value in changes.items():
+            setattr(message, name, value)
+        self.publish(f"/{camera}/image", message)
+
+    def poses(self) -> list[PoseArray]:
+        return self.got["/head_detector/poses"]
+
+    def status(self) -> dict[str, str]:
+        """The newest diagnostics: its rows, and its level and message."""
+        messages = self.got["/diagnostics"]
+        if not messages:
+            return {}
+        status = messages[-1].status[0]
+        return {
+            **{row.key: row.value for row in status.values},
+            "level": status.level[0],
+            "message": status.message,
+        }
+
+    def close(self) -> None:
+        self.node.destroy_node()
+
+
+def header(frame: str, stamp_ns: int) -> Header:
+    made = Header(frame_id=frame)
+    made.stamp.sec, made.stamp.nanosec = divmod(int(stamp_ns), NS)
+    return made
+
+
+def data_of(values) -> array.array:
+    data = array.array("B")
+    data.frombytes(np.ascontiguousarray(values).data.cast("B"))
+    return data
+
+
+def cloud_of(points, frame: str, stamp_ns: int, **changes) -> PointCloud2:
+    points = np.ascontiguousarray(points, dtype=np.float32)
+    fields = [
+        PointField(name=n, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, n in enumerate("xyz")
+    ]
+    message = PointCloud2(
+        header=header(frame, stamp_ns),
+        height=1,
+        width=len(points),
+        fields=fields,
+        point_step=12,
+        row_step=12 * len(points),
+        data=data_of(points) if len(points) else array.array("B"),
+    )
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def xyz(pose) -> np.ndarray:
+    return np.array([pose.position.x, pose.position.y, pose.position.z])
+
+
+def stamp_of(message) -> int:
+    return message.header.stamp.sec * NS + message.header.stamp.nanosec
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ros():
+    """Only this machine, a domain of our own, and shared memory that holds a cloud."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PACKAGE / "config" / "fastdds_large_clouds.xml")
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture(scope="module")
+def robot():
+    robot = Robot()
+    yield robot
+    robot.close()
+
+
+@pytest.fixture(scope="session")
+def sample() -> Path:
+    """The recording that ships with headvox: two cameras, three people."""
+    return Path(headvox.__file__).parent / "assets" / "sample"
+
+
+@pytest.fixture(scope="session")
+def frames(sample):
+    return list(headvox.open_source(sample))

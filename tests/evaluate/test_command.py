@@ -56,7 +56,7 @@ def test_a_recording_is_scored(recording: Path, capsys: pytest.CaptureFixture[st
     out = tmp_path / "report"
     assert main(["eval", str(recording), "--details", "-o", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert shown.splitlines()[0].split()[:3] == ["scenario", "detector", "tuned"]
+    assert shown.splitlines()[0].split()[:3] == ["detection", "detector", "tuned"]
     assert shown.splitlines()[1].split()[:3] == ["six", "default", "no"]
     assert "distance [m]" in shown
     assert "both thresholds: recording filinha" in shown
@@ -216,11 +216,31 @@ def test_bad_truth_is_told(
     assert told in capsys.readouterr().err
 
 
+def test_heads_in_a_frame_that_cannot_be_read_are_missed(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(recording, damaged)
+    (damaged / "left" / "000002.png").write_bytes(b"no picture")
+    found = {}
+    for path in (recording, damaged):
+        assert main(["eval", str(path), "--json"]) == 0
+        captured = capsys.readouterr()
+        found[path.name] = json.loads(captured.out)["scores"][0]
+    assert "damaged: 1 of 6 frames could not be used" in captured.err
+    assert found["damaged"]["heads"] == found["six"]["heads"] == 17
+    assert found["six"]["found"] - 3 <= found["damaged"]["found"] < found["six"]["found"]
+
+
 def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval"]) == 2
     assert main(["eval", "static", "--heads", "x.jsonl"]) == 2
     assert main(["eval", str(clouds), "--radius", "-1"]) == 2
     assert main(["eval", str(clouds), "--max-range", "-1"]) == 2
+    assert main(["eval", "static", "--seed", "-1"]) == 2
+    assert main(["eval", str(clouds), "--against", "nonsense"]) == 1
+    assert main(["eval", str(clouds), "-o", str(clouds / "0.npy")]) == 1
+    capsys.readouterr()
     (clouds / "heads.jsonl").unlink()
     assert main(["eval", str(clouds)]) == 1
     assert "there is no heads.jsonl beside it" in capsys.readouterr().err

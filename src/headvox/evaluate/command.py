@@ -90,6 +90,11 @@ def _evaluate(args: argparse.Namespace) -> int:
     rules = Rules(args.radius, args.clear, args.count_truncated)
     configs = [config_of(args)]
     configs += [replace(configs[0], cascade=name) for name in args.against]
+    made = _made(
+        configs, rules, args
+    )  # what is wrong with a cascade is told now, and what with the folder, too
+    if args.output is not None:
+        args.output.mkdir(parents=True, exist_ok=True)
     live = Live(sys.stderr, None)
     scores: list[Scores] = []
     runs: list[tuple[Scenario, Scores, Run]] = []
@@ -100,7 +105,7 @@ def _evaluate(args: argparse.Namespace) -> int:
                 runs.append((scenario, done[0][0], done[1]))
     finally:
         live.close()
-    report = Report(tuple(scores), _made(configs, rules, args))
+    report = Report(tuple(scores), made)
     if args.output is not None:
         _write(report, runs, rules, args.output)
     print(json.dumps(_plain(report), indent=1, allow_nan=False) if args.json else _text(report, args.details))
@@ -171,7 +176,7 @@ def _run(
         run = run_detector(scenario, config, rules, show)
         if run.bad:
             live.note(
-                f"headvox: {scenario.name}: {run.bad} frames could not be used; their heads count as missed"
+                f"headvox: {scenario.name}: {run.bad} of {scenario.length} frames could not be used: their heads are missed"
             )
         done.append(
             (_scores(scenario, config.cascade, load_cascade(config.cascade).tuned_on, run, rules), run)
@@ -241,7 +246,6 @@ def _write(report: Report, runs: Sequence[tuple[Scenario, Scores, Run]], rules: 
     from headvox.evaluate.plots import need_matplotlib, plot_scenario
     from headvox.plot_masks import file_name
 
-    folder.mkdir(parents=True, exist_ok=True)
     report.save(folder / "report.json")
     need_matplotlib()
     for name in dict.fromkeys(scenario.name for scenario, _, _ in runs):
@@ -323,7 +327,7 @@ def _parser() -> argparse.ArgumentParser:
         "--revolutions", type=length, default=1.0, metavar="R", help="rotation: how many turns (1)"
     )
     scenes.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="another number, other heads and people (0)"
+        "--seed", type=not_negative, default=0, metavar="N", help="another number, other heads and people (0)"
     )
     add_settings(parser)
     return parser
@@ -337,6 +341,14 @@ def limit(text: str) -> Limit:
         return Limit.parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def not_negative(text: str) -> int:
+    """Read a whole number from 0 on, for argparse."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected at least 0, got {text!r}")
+    return value
 
 
 def length(text: str) -> float:

@@ -68,7 +68,8 @@ class Report:
 
     def table(self) -> str:
         """Return what a person wants to see first."""
-        text = [table(SUMMARY, [_summary(s) for s in self.scores])]
+        text = [table(DETECTION, [_detection(s) for s in self.scores])]
+        text.append(table(ERRORS, [_errors(s) for s in self.scores]))
         turned = [_orientation(s) for s in self.scores if s.oriented]
         if turned:
             text.append(table(ORIENTATION, turned))
@@ -88,9 +89,13 @@ class Report:
         return table(header, rows) if rows else ""
 
 
-SUMMARY = (
-    "scenario", "detector", "tuned on", "frames", "heads", "found", "recall", "false/frame", "precision", "mean cm",
-    "median", "p90", "bias x y z cm", "scatter", "p50 ms", "p99 ms",
+DETECTION = (
+    "detection", "detector", "tuned on", "frames", "heads", "found", "recall", "precision", "false/frame", "AP",
+    "truncated, found",
+)  # fmt: skip
+ERRORS = (
+    "centre and time", "detector", "mean cm", "median", "p90", "bias x y z", "scatter", "p50 ms", "p95", "p99",
+    "jitter",
 )  # fmt: skip
 ORIENTATION = (
     "orientation", "detector", "stated", "flips", "mean °", "median", "p90", "yaw", "pitch", "roll",
@@ -101,13 +106,20 @@ TRACKING = (
 )  # fmt: skip
 
 
-def _summary(s: Scores) -> list[str]:
-    bias = "" if s.centre_bias_m is None else " ".join(f"{100 * v:+.1f}" for v in s.centre_bias_m)
+def _detection(s: Scores) -> list[str]:
     return [
         s.scenario, s.detector, s.tuned, str(s.frames), str(s.heads), str(s.found) if s.heads else "",
-        _share(s.recall), _number(s.false_per_frame, 3), _share(s.precision), _cm(s.centre_mean_m),
-        _cm(s.centre_median_m), _cm(s.centre_p90_m), bias, _cm(s.centre_scatter_m),
-        _number(s.latency_p50_ms, 2), _number(s.latency_p99_ms, 2),
+        _share(s.recall), _share(s.precision), _number(s.false_per_frame, 3), _number(s.average_precision, 3),
+        f"{s.truncated}, {s.truncated_found}" if s.truncated else "",
+    ]  # fmt: skip
+
+
+def _errors(s: Scores) -> list[str]:
+    bias = "" if s.centre_bias_m is None else " ".join(f"{100 * v:+.1f}" for v in s.centre_bias_m)
+    return [
+        s.scenario, s.detector, _cm(s.centre_mean_m), _cm(s.centre_median_m), _cm(s.centre_p90_m), bias,
+        _cm(s.centre_scatter_m), _number(s.latency_p50_ms, 2), _number(s.latency_p95_ms, 2),
+        _number(s.latency_p99_ms, 2), _number(s.latency_jitter_ms, 2),
     ]  # fmt: skip
 
 

@@ -96,7 +96,7 @@ def run(
         for index, frame in enumerate(islice(iter(source), limit)):
             report.frames += 1
             try:
-                result, stage_ms = _look(detector, tracker, frame, index)
+                result, stage_ms = look(detector, tracker, frame, index)
             except HeadvoxError as error:
                 report.bad += 1
                 if strict or source.length == 1:
@@ -127,10 +127,14 @@ def run(
     return report
 
 
-def _look(
+def look(
     detector: FrameDetector, tracker: Tracker | None, frame: Frame | BadFrame, index: int
 ) -> tuple[Result, dict[str, float]]:
-    """Return what was found in a frame, and what each stage took."""
+    """Return what was found in a frame, timed, and what each stage took.
+
+    Raises:
+        HeadvoxError: the frame could not be read, or cannot be used.
+    """
     if isinstance(frame, BadFrame):
         raise HeadvoxError(frame.reason)
     begun = time.perf_counter()

@@ -61,15 +61,21 @@ def test_a_recording_is_scored(recording: Path, capsys: pytest.CaptureFixture[st
     assert "distance [m]" in shown
     assert "both thresholds: recording filinha" in shown
     report = json.loads((out / "report.json").read_text("utf-8"))
-    (scores,) = report["scores"]
+    scores, tracks = report["scores"]
+    assert (scores["detector"], tracks["detector"]) == ("default", "default tracked")
+    assert scores["hota"] is None
+    assert 0 < tracks["hota"] <= 1
     assert (scores["frames"], scores["heads"], scores["truncated"]) == (6, 17, 1)
     assert scores["recall"] == scores["found"] / 17 > 0.8
     assert scores["latency_p50_ms"] > 0
     assert scores["centre_mean_m"] < 0.05
     assert scores["curve"][-1][1] >= scores["recall"]
     assert sum(group["heads"] for group in scores["groups"]["posture"]) == 17
-    expected = {"report.json", "six.png"} | ({"six-default-false.png"} if scores["false"] else set())
-    expected |= {"six-default-misses.png"} if scores["found"] < 17 else set()
+    expected = {"report.json", "six.png"}
+    for row in (scores, tracks):
+        stem = f"six-{row['detector'].replace(' ', '-')}"
+        expected |= {f"{stem}-false.png"} if row["false"] else set()
+        expected |= {f"{stem}-misses.png"} if row["found"] < 17 else set()
     assert {path.name for path in out.iterdir()} == expected
 
 
@@ -77,7 +83,8 @@ def test_the_worst_mistakes_are_drawn(
     recording: Path, clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # With a radius of 1 mm everything is missed and false: six rows each of a depth image and two views.
-    assert main(["eval", str(recording), "--radius", "0.001", "-o", str(tmp_path / "depth")]) == 0
+    command = ["eval", str(recording), "--no-track", "--radius", "0.001", "-o", str(tmp_path / "depth")]
+    assert main(command) == 0
     found = lines(tmp_path / "other.jsonl", {0: [[2, 0, 1]]})
     assert main(["eval", str(clouds), "--heads", str(found), "-o", str(tmp_path / "cloud")]) == 0
     sizes = {}
@@ -114,18 +121,19 @@ def test_mistakes_at_one_place_are_told_once() -> None:
 def test_what_headvox_run_wrote_scores_as_the_detector_does(
     recording: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    found = tmp_path / "mine.jsonl"
-    assert main(["run", str(recording), "--no-track", "-o", str(found)]) == 0
-    capsys.readouterr()
-    reports = []
-    for more in ([], ["--heads", str(found)]):
-        assert main(["eval", str(recording), "--json", *more]) == 0
-        reports.append(json.loads(capsys.readouterr().out))
-    ours, theirs = (report["scores"][0] for report in reports)
-    assert theirs["detector"] == "mine"
-    for figure in ("frames", "heads", "found", "false", "recall", "precision"):
-        assert ours[figure] == theirs[figure]
-    assert theirs["centre_mean_m"] == pytest.approx(ours["centre_mean_m"], abs=1e-4)
+    assert main(["eval", str(recording), "--json"]) == 0
+    ours = json.loads(capsys.readouterr().out)["scores"]
+    for row, more in zip(ours, (["--no-track"], []), strict=True):
+        found = tmp_path / "mine.jsonl"
+        assert main(["run", str(recording), "-o", str(found), *more]) == 0
+        capsys.readouterr()
+        assert main(["eval", str(recording), "--json", "--heads", str(found)]) == 0
+        (theirs,) = json.loads(capsys.readouterr().out)["scores"]
+        assert theirs["detector"] == "mine"
+        for figure in ("frames", "heads", "found", "false", "recall", "precision", "switches"):
+            assert row[figure] == theirs[figure]
+        assert theirs["centre_mean_m"] == pytest.approx(row["centre_mean_m"], abs=1e-4)
+        assert theirs["hota"] == pytest.approx(row["hota"], abs=0.02)
 
 
 def test_another_detector_by_hand(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ import os
 import platform
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from headvox.cli import (
     config_of,
     number,
     sample_folder,
+    tracker_config_of,
     whole_number,
 )
 from headvox.live import Live
@@ -28,7 +30,7 @@ from headvox.table import printable
 
 if TYPE_CHECKING:
     from headvox.config import DetectorConfig
-    from headvox.evaluate.loop import Run
+    from headvox.evaluate.loop import Finder, Run
     from headvox.evaluate.match import Rules
     from headvox.evaluate.report import Limit, Report
     from headvox.evaluate.scenarios import Scenario
@@ -63,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
     parser = _parser()
     args = parser.parse_args(argv)
     try:
-        return _evaluate(args)
+        return _report(args)
     except UsageError as error:
         parser.error(str(error))
 
@@ -83,7 +85,7 @@ def _compare(argv: Sequence[str]) -> int:
     return GOOD
 
 
-def _evaluate(args: argparse.Namespace) -> int:
+def _report(args: argparse.Namespace) -> int:
     from headvox.evaluate.match import Rules
     from headvox.evaluate.report import Report
 
@@ -95,16 +97,13 @@ def _evaluate(args: argparse.Namespace) -> int:
     )  # what is wrong with a cascade is told now, and what with the folder, too
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
-    live = Live(sys.stderr, None)
     scores: list[Scores] = []
     runs: list[tuple[Scenario, Scores, Run]] = []
-    try:
+    with closing(Live(sys.stderr, None)) as live:
         for scenario in _scenarios(args, live):
-            for done in _run(scenario, configs, args, scenario.rules or rules, live):
-                scores += done[0]
-                runs.append((scenario, done[0][0], done[1]))
-    finally:
-        live.close()
+            for several, run in _evaluate(scenario, configs, args, scenario.rules or rules, live):
+                scores += several
+                runs.append((scenario, several[0], run))
     report = Report(tuple(scores), made)
     if args.output is not None:
         _write(report, runs, rules, args.output)
@@ -154,53 +153,55 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
     return made
 
 
-def _run(
+def _evaluate(
     scenario: Scenario, configs: Sequence[DetectorConfig], args: argparse.Namespace, rules: Rules, live: Live
 ) -> list[tuple[list[Scores], Run]]:
-    """Return the scores of each detector on a scenario, and what it found."""
+    """Return the scores of each finder on a scenario, and what it found."""
+    from headvox.evaluate.loop import go_over
+
+    with ExitStack() as stack:
+        finders = _finders(scenario, configs, args, stack)
+        runs = go_over(
+            scenario, finders, rules, lambda k: live.show(f"{scenario.name}: frame {k} of {scenario.length}")
+        )
+    if runs[0].bad:
+        what = f"{runs[0].bad} of {scenario.length} frames could not be used: their heads are missed"
+        live.note(f"headvox: {scenario.name}: {what}")
+    return [(_scores(scenario, finder, run, rules), run) for finder, run in zip(finders, runs, strict=True)]
+
+
+def _finders(
+    scenario: Scenario, configs: Sequence[DetectorConfig], args: argparse.Namespace, stack: ExitStack
+) -> list[Finder]:
+    """Return what is to look at a scenario: another program's lines, or each cascade, bare and with a tracker."""
     from headvox.evaluate.found import read_found
-    from headvox.evaluate.loop import run_detector, run_lines
-    from headvox.evaluate.scores import score
-    from headvox.masks import load_cascade
+    from headvox.evaluate.loop import bare, tracked, written
 
     if args.heads is not None:
-        run = run_lines(scenario, read_found(args.heads), rules)
-        name = args.name or args.heads.stem
-        return [([score(scenario.name, name, run.samples, rules)], run)]
-    done = []
+        stamps = {frame.stamp_ns for frame, _ in scenario.frames()}
+        return [written(args.name or args.heads.stem, read_found(args.heads), stamps)]
+    finders = []
     for config in configs:
-
-        def show(k: int, config: DetectorConfig = config) -> None:
-            live.show(f"{scenario.name}, {config.cascade}: frame {k} of {scenario.length}")
-
-        run = run_detector(scenario, config, rules, show)
-        if run.bad:
-            live.note(
-                f"headvox: {scenario.name}: {run.bad} of {scenario.length} frames could not be used: their heads are missed"
-            )
-        done.append(
-            (_scores(scenario, config.cascade, load_cascade(config.cascade).tuned_on, run, rules), run)
-        )
-    return done
+        finders.append(bare(config, stack))
+        if scenario.moving and not args.no_track:
+            finders.append(tracked(config, tracker_config_of(args), stack))
+    return finders
 
 
-def _scores(
-    scenario: Scenario, cascade: str, tuned_on: Sequence[str], run: Run, rules: Rules
-) -> list[Scores]:
+def _scores(scenario: Scenario, finder: Finder, run: Run, rules: Rules) -> list[Scores]:
     """Return the scores on all frames, and those on the frames kept aside where some were not."""
-    import numpy as np
-
     from headvox.evaluate.heldout import tuned_frames, word
     from headvox.evaluate.scores import score
 
     labelled = [sample for sample in run.samples if sample.true is not None]
-    used = (
-        tuned_frames(tuned_on, scenario.recording, len(labelled)) if scenario.recording else np.zeros(0, bool)
-    )
-    scores = [score(scenario.name, cascade, run.samples, rules, word(used, tuned_on, scenario.synthetic))]
+    if finder.tuned_on is None:
+        return [score(scenario.name, finder.name, run.samples, rules)]
+    used = tuned_frames(finder.tuned_on, scenario.recording, len(labelled))
+    tuned = word(used, finder.tuned_on, scenario.synthetic)
+    scores = [score(scenario.name, finder.name, run.samples, rules, tuned)]
     if used.any() and not used.all():
         aside = [sample for sample, was_used in zip(labelled, used, strict=True) if not was_used]
-        scores.append(score(f"{scenario.name}, kept aside", cascade, aside, rules, "no"))
+        scores.append(score(f"{scenario.name}, kept aside", finder.name, aside, rules, "no"))
     return scores
 
 
@@ -220,6 +221,7 @@ def _made(configs: Sequence[DetectorConfig], rules: Rules, args: argparse.Namesp
         "cores": os.cpu_count(),
         "rules": asdict(rules),
         "settings": [] if args.heads else [asdict(config) for config in configs],
+        "tracker": None if args.heads or args.no_track else asdict(tracker_config_of(args)),
         "tuned_on": {}
         if args.heads
         else {c.cascade: list(load_cascade(c.cascade).tuned_on) for c in configs},
@@ -274,6 +276,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("what", nargs="+", metavar="WHAT", help="see below")
     parser.add_argument(
         "--against", action="append", default=[], metavar="CASCADE", help="evaluate this one, too"
+    )
+    parser.add_argument(
+        "--no-track", action="store_true", help="bare detections only, no second row with a tracker"
     )
     parser.add_argument(
         "-o", dest="output", type=Path, metavar="DIR", help="write report.json, plots and pictures"

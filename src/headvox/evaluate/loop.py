@@ -1,23 +1,26 @@
-"""A detector over a scenario: one sample a frame, and the frames that went worst."""
+"""Detectors over a scenario: one sample a frame, and the frames that went worst."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from headvox.config import DetectorConfig
-from headvox.data import F64, BadFrame, Frame, Heads
+from headvox.config import DetectorConfig, TrackerConfig
+from headvox.data import F64, BadFrame, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
 from headvox.evaluate.found import FoundHeads
 from headvox.evaluate.match import Rules, match
 from headvox.evaluate.metrics import Sample, counted
 from headvox.evaluate.scenarios import Scenario
 from headvox.evaluate.truth import NO_ID, Bools, TrueHeads
+from headvox.masks import load_cascade
 from headvox.pipeline import Detector
+from headvox.run import look
+from headvox.track import Tracker
 from headvox.warmup import warm_up
 
 LOWEST_SCORE = -100.0
@@ -59,81 +62,105 @@ class Run:
     bad: int = 0
 
 
-def run_detector(
-    scenario: Scenario,
-    config: DetectorConfig,
-    rules: Rules,
-    on_frame: Callable[[int], None] = lambda number: None,
-) -> Run:
-    """Find the heads in every frame: once as configured, timed, and once more without threshold, not timed."""
+@dataclass(frozen=True, slots=True)
+class Finder:
+    """A detector as an evaluation sees it: ``find`` gives what it found, and what it finds without a threshold.
+
+    ``tuned_on`` is what its cascade says; None where nobody can tell.
+    """
+
+    name: str
+    tuned_on: tuple[str, ...] | None
+    find: Callable[[Frame], tuple[FoundHeads, FoundHeads | None]]
+
+
+def bare(config: DetectorConfig, stack: ExitStack) -> Finder:
+    """Return a detector that takes every frame by itself; without a threshold it is not timed."""
     warm_up(config)
-    outcome = Run()
-    with ExitStack() as stack:
-        detector = stack.enter_context(closing(Detector(config)))
-        sweeper = stack.enter_context(closing(Detector(replace(config, min_score=LOWEST_SCORE))))
+    detector = stack.enter_context(closing(Detector(config)))
+    sweeper = stack.enter_context(closing(Detector(replace(config, min_score=LOWEST_SCORE))))
 
-        def find(frame: Frame) -> tuple[FoundHeads, FoundHeads | None]:
-            begun = time.perf_counter()
-            heads = detector.detect_frame(frame)
-            found = found_of(heads, 1e3 * (time.perf_counter() - begun))
-            return found, found_of(sweeper.detect_frame(frame))
+    def find(frame: Frame) -> tuple[FoundHeads, FoundHeads]:
+        result, _ = look(detector, None, frame, 0)
+        return of_heads(result.heads, result.latency_ms), of_heads(sweeper.detect_frame(frame))
 
-        _go_over(scenario, find, outcome, rules, on_frame)
-    return outcome
+    return Finder(config.cascade, load_cascade(config.cascade).tuned_on, find)
 
 
-def run_lines(scenario: Scenario, lines: dict[int, FoundHeads], rules: Rules) -> Run:
-    """Take what another program found, by the stamps; a frame without a line has no heads.
+def tracked(config: DetectorConfig, tracker_config: TrackerConfig, stack: ExitStack) -> Finder:
+    """Return a detector with a tracker, as ``headvox run`` has them: what it states are the tracks."""
+    warm_up(config)
+    detector = stack.enter_context(closing(Detector(config)))
+    tracker = Tracker(tracker_config)
+
+    def find(frame: Frame) -> tuple[FoundHeads, None]:
+        result, _ = look(detector, tracker, frame, 0)
+        assert result.tracks is not None
+        return of_tracks(result.tracks, result.latency_ms), None
+
+    return Finder(f"{config.cascade} tracked", load_cascade(config.cascade).tuned_on, find)
+
+
+def written(name: str, lines: Mapping[int, FoundHeads], stamps: Set[int]) -> Finder:
+    """Return what another program wrote, by the stamps of a recording; a frame without a line has no heads.
 
     Raises:
-        HeadvoxError: no line has the stamp of a frame.
+        HeadvoxError: no line has one of the ``stamps``.
     """
-    outcome = Run()
-    seen: set[int] = set()
+    if not stamps & lines.keys():
+        raise HeadvoxError(
+            f"{name}: no line has the stamp of a frame of the recording.", "Is it what was found in this one?"
+        )
 
     def find(frame: Frame) -> tuple[FoundHeads, FoundHeads | None]:
-        seen.add(frame.stamp_ns)
         found = lines.get(frame.stamp_ns, FoundHeads.none())
         return found, found if np.isfinite(found.scores).all() else None
 
-    _go_over(scenario, find, outcome, rules, lambda number: None)
-    if not seen & lines.keys():
-        raise HeadvoxError(
-            f"{scenario.name}: no line has the stamp of one of its frames.",
-            "Are the lines of this recording?",
-        )
-    return outcome
+    return Finder(name, None, find)
 
 
-def found_of(heads: Heads, latency_ms: float = float("nan")) -> FoundHeads:
+def of_heads(heads: Heads, latency_ms: float = math.nan) -> FoundHeads:
     """Return bare detections as found heads."""
     return FoundHeads(heads.centres, heads.quaternions, heads.scores, np.full(len(heads), NO_ID), latency_ms)
 
 
-def _go_over(
-    scenario: Scenario,
-    find: Callable[[Frame], tuple[FoundHeads, FoundHeads | None]],
-    outcome: Run,
-    rules: Rules,
-    on_frame: Callable[[int], None],
-) -> None:
+def of_tracks(tracks: Tracks, latency_ms: float) -> FoundHeads:
+    """Return tracks as found heads; those that are tentative have no id."""
+    ids = np.where(tracks.ids > 0, tracks.ids, NO_ID)
+    return FoundHeads(tracks.centres, tracks.quaternions, tracks.scores, ids, latency_ms)
+
+
+def go_over(
+    scenario: Scenario, finders: Sequence[Finder], rules: Rules, on_frame: Callable[[int], None]
+) -> list[Run]:
+    """Let every finder look at every frame, one after another."""
+    runs = [Run() for _ in finders]
     for number, (frame, true) in enumerate(scenario.frames()):
-        if isinstance(frame, BadFrame):
-            outcome.bad += 1
-            outcome.samples.append(Sample(frame.stamp_ns, FoundHeads.none(), true, np.empty((0, 3))))
-            continue
-        try:
-            found, swept = find(frame)
-        except HeadvoxError:  # a frame that no head can be found in; its heads are missed
-            outcome.bad += 1
-            found, swept = FoundHeads.none(), FoundHeads.none()
-        sensors = [image.T_world_camera[:3, 3] for image in frame.depths]
-        sensors += [cloud.T_world_sensor[:3, 3] for cloud in frame.clouds if cloud.T_world_sensor is not None]
-        outcome.samples.append(Sample(frame.stamp_ns, found, true, np.array(sensors).reshape(-1, 3), swept))
-        if true is not None:
-            _keep_worst(outcome, scenario.moving, number, frame, found, true, rules)
+        sensors = _sensors(frame)
+        for finder, run in zip(finders, runs, strict=True):
+            try:
+                if isinstance(frame, BadFrame):
+                    raise HeadvoxError(frame.reason)
+                found, swept = finder.find(frame)
+            except HeadvoxError:  # a frame that no head can be found in: its heads are missed
+                run.bad += 1
+                found, swept = FoundHeads.none(), FoundHeads.none()
+            run.samples.append(Sample(frame.stamp_ns, found, true, sensors, swept))
+            if true is not None and isinstance(frame, Frame):
+                _keep_worst(run, scenario.moving, number, frame, found, true, rules)
         on_frame(number + 1)
-    del outcome.misses[MOST_WORST:], outcome.false[MOST_WORST:]
+    for run in runs:
+        del run.misses[MOST_WORST:], run.false[MOST_WORST:]
+    return runs
+
+
+def _sensors(frame: Frame | BadFrame) -> F64:
+    """Return where the sensors stand, (S, 3), as far as is known."""
+    if isinstance(frame, BadFrame):
+        return np.empty((0, 3))
+    places = [image.T_world_camera[:3, 3] for image in frame.depths]
+    places += [cloud.T_world_sensor[:3, 3] for cloud in frame.clouds if cloud.T_world_sensor is not None]
+    return np.array(places).reshape(-1, 3)
 
 
 def _keep_worst(

@@ -55,7 +55,7 @@ def score_tracks(samples: Sequence[Sample], rules: Rules) -> TrackingScores | No
         HeadvoxError: motmetrics is not installed.
     """
     labelled = [sample for sample in samples if sample.true is not None]
-    frames = [_tracks(k, sample, rules) for k, sample in enumerate(labelled)]
+    frames = [_tracks(sample, rules) for sample in labelled]
     has_people = any(len(f.true_ids) for f in frames) and all((f.true_ids != NO_ID).all() for f in frames)
     if not has_people or all((s.found.ids == NO_ID).all() for s in labelled):
         return None
@@ -68,16 +68,15 @@ def score_tracks(samples: Sequence[Sample], rules: Rules) -> TrackingScores | No
     )  # fmt: skip
 
 
-def _tracks(number: int, sample: Sample, rules: Rules) -> Tracks:
-    """Leave out what counts neither way: ignored heads and what is on them."""
+def _tracks(sample: Sample, rules: Rules) -> Tracks:
+    """Leave out ignored heads and what is on them, and what was found without an id: it says nothing of who it is."""
     assert sample.true is not None
     true, found, kept = sample.true, sample.found, counted(sample.true, rules)
-    scored = np.setdiff1d(np.arange(len(found)), match(found.centres, true.centres, kept, rules).excused)
+    named = np.nonzero(found.ids != NO_ID)[0]
+    excused = match(found.centres[named], true.centres, kept, rules).excused
+    scored = np.delete(named, excused)
     away = np.linalg.norm(true.centres[kept][:, None] - found.centres[scored][None], axis=2)
-    ids = found.ids[scored].copy()
-    alone = ids == NO_ID  # a detection without a track is a track of its own
-    ids[alone] = NO_ID - 1 - np.arange(alone.sum()) - (number << 20)
-    return Tracks(true.ids[kept], ids, away)
+    return Tracks(true.ids[kept], found.ids[scored], away)
 
 
 def clear_mot(frames: Sequence[Tracks], radius_m: float) -> dict[str, Any]:

@@ -1,5 +1,9 @@
 """Vectors in kernels do what numpy does, whatever the processor makes of them."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -12,6 +16,7 @@ from headvox.simd import (
     bit_and,
     bit_counts,
     choose,
+    compress,
     equal,
     fill,
     larger,
@@ -92,6 +97,11 @@ def converted(a, out):
 @bare_kernel
 def between(a, at, low, high):
     return within(load(a, at), low, high)
+
+
+@bare_kernel
+def packed(a, at, bits, out):
+    return compress(out, at, bits, load(a, 0))
 
 
 @bare_kernel
@@ -180,3 +190,23 @@ def test_what_is_done_within_a_vector(dtype, wider, count):
     kept = np.where(np.arange(LANES) < count, x, 0)
     np.testing.assert_array_equal(out, [np.cumsum(x, dtype=dtype), np.full(LANES, x[-1]), kept, counts])
     np.testing.assert_array_equal(wide, x)
+
+
+@pytest.mark.parametrize("bits", [0, 1, 1 << 31, 0xFFFFFFFF, 0x5A0FF3C1])
+def test_compress_writes_the_chosen_lanes_one_after_the_other(bits):
+    a = np.arange(100, 100 + LANES, dtype=np.int32)
+    out = np.full(3 * LANES, -1, np.int32)
+    chosen = [value for lane, value in enumerate(a) if bits >> lane & 1]
+    assert packed(a, 5, np.uint32(bits), out) == 5 + len(chosen)
+    assert out[: 5 + len(chosen)].tolist() == [-1] * 5 + chosen
+    assert (out[5 + LANES + 1 :] == -1).all()
+
+
+def test_a_processor_without_any_extension_gives_the_same():
+    """The tests of this file again, compiled for the least processor of this kind."""
+    environment = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    names = "equals_numpy or within_a_vector or compress"
+    command = [sys.executable, "-m", "pytest", __file__, "-k", f"({names}) and not processor"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "passed" in done.stdout

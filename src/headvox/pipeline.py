@@ -432,7 +432,7 @@ class _Memory:
 
     def make_room_for_width(self, pixels: int) -> None:
         """Have room for images as wide as that."""
-        if len(self.marking[0].codes) < pixels:
+        if len(self.marking[0].codes) < pixels + LANES:
             self.marking = [Marking.of(pixels) for _ in self.marking]
 
     def make_room(self, candidates: int) -> None:

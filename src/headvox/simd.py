@@ -306,6 +306,36 @@ def within(typingctx, a, low, high):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def compress(typingctx, flat, at, bits, a):  # type: ignore[no-untyped-def]
+    """Write those lanes of ``a`` whose bit is set one after the other to ``flat`` from ``at`` on; return their end.
+
+    What lies behind them is overwritten, as far as all lanes would go.
+    """
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        array, place, mask, lanes = arguments
+        data = context.make_array(signature.args[0])(context, builder, array).data
+        place = context.cast(builder, place, signature.args[1], types.int64)
+        if (
+            "+avx512f" in context.codegen()._tm_features
+        ):  # has an instruction for it; LLVM would make branches else
+            kinds = [lanes.type, data.type, ir.VectorType(ir.IntType(1), LANES)]
+            name = f"llvm.masked.compressstore.v{LANES}i{lanes.type.element.width}"
+            kind = ir.FunctionType(ir.VoidType(), kinds)
+            function = cgutils.get_or_insert_function(builder.module, kind, name)
+            builder.call(function, [lanes, builder.gep(data, [place]), builder.bitcast(mask, kinds[2])])
+            return builder.add(place, builder.zext(builder.ctpop(mask), place.type))
+        for lane in range(LANES):
+            number = ir.Constant(mask.type, lane)
+            builder.store(builder.extract_element(lanes, number), builder.gep(data, [place]))
+            bit = builder.and_(builder.lshr(mask, number), ir.Constant(mask.type, 1))
+            place = builder.add(place, builder.zext(bit, place.type))
+        return place
+
+    return types.int64(flat, at, types.uint32, a), emit
+
+
+@intrinsic
 def lowest(typingctx, bits):  # type: ignore[no-untyped-def]
     """Return the number of the lowest bit that is set in ``bits``, which is not 0."""
 

@@ -26,12 +26,12 @@ from headvox.simd import (
     add,
     below,
     bit_and,
+    compress,
     equal,
     fill,
     larger,
     load,
     load_triples,
-    lowest,
     mul,
     shift_right,
     shifted,
@@ -48,6 +48,7 @@ NOWHERE = np.int32(-1)
 FARTHEST = np.int32(2**31 - 1)
 MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
 ALL = np.uint32(0xFFFFFFFF)
+MOST_NEW = 1024  # codes that are entered at a time
 
 Cells = npt.NDArray[np.uint8] | npt.NDArray[np.uint32]
 
@@ -141,11 +142,36 @@ def _code(x, y, z, ny, nz, shift):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _enter(codes, at, new, counting, cells):  # type: ignore[no-untyped-def]
-    """Enter those of the codes from ``at`` on whose bit is set in ``new``."""
-    while new:
-        code = np.uint32(codes[at + lowest(new)])
-        new &= new - np.uint32(1)
+def _mark(x, y, z, known, left, codes, at, limits, shape, shift, counting, extremes, new, count):  # type: ignore[no-untyped-def]
+    """Write the codes of LANES places, in parts from the origin, to ``new`` from ``count`` on.
+
+    Left out are places whose bit in ``known`` is not set, and such as repeat others. ``left`` are the codes of the
+    LANES places before, and ``codes`` from ``at`` on are others that may be repeated: neighbours mostly fall into one
+    part, and a part has to be entered but once. ``codes`` is overwritten. Return the codes; ``extremes`` widened by
+    the cells: the lowest and the highest in x, y and z, a vector each; and the new count.
+    """
+    inside = known & _inside(x, y, z, limits)
+    mine = fill(NOWHERE)
+    if inside:
+        x, y, z = to_int(x), to_int(y), to_int(z)
+        mine = where(inside, _code(x, y, z, shape[1], shape[2], shift), mine)
+        if not counting:
+            above = equal(mine, load(codes, at)) | equal(mine, load(codes, at + 1))
+            inside &= ~(above | equal(mine, shifted(left, mine)))
+        extremes = _widened(
+            extremes, inside, shift_right(x, shift), shift_right(y, shift), shift_right(z, shift)
+        )
+        count = compress(new, count, inside, mine)
+    store(codes, at, mine)
+    return mine, extremes, count
+
+
+@rule
+def _enter(new, count, counting, cells):  # type: ignore[no-untyped-def]
+    """Enter ``count`` codes into the grid."""
+    # Unsigned, because a signed index costs a check for counting from the end.
+    for k in range(np.uint64(count)):
+        code = np.uint32(new[k])
         if counting:
             cells[code >> np.uint32(3)] += 1
         else:
@@ -153,59 +179,38 @@ def _enter(codes, at, new, counting, cells):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _mark(x, y, z, known, left, codes, at, limits, shape, shift, counting, extremes, cells):  # type: ignore[no-untyped-def]
-    """Enter LANES places, in parts from the origin, as far as their bits in ``known`` are set; return their codes.
-
-    ``left`` are the codes of the LANES places before, and ``codes`` from ``at`` on are others that these may repeat:
-    neighbours mostly fall into one part, and a part is entered but once. ``codes`` is overwritten.
-    """
-    inside = known & _inside(x, y, z, limits)
-    x, y, z = to_int(x), to_int(y), to_int(z)
-    mine = where(inside, _code(x, y, z, shape[1], shape[2], shift), fill(NOWHERE))
-    new = inside
-    if not counting:
-        new &= ~(equal(mine, shifted(left, mine)) | equal(mine, load(codes, at)))
-    store(codes, at, mine)
-    if new:
-        _widen(extremes, 0, new, shift_right(x, shift))
-        _widen(extremes, 1, new, shift_right(y, shift))
-        _widen(extremes, 2, new, shift_right(z, shift))
-        _enter(codes, at, new, counting, cells)
-    return mine
+def _widened(extremes, new, x, y, z):  # type: ignore[no-untyped-def]
+    a, b, c, d, e, f = extremes
+    return (
+        where(new, smaller(a, x), a), where(new, smaller(b, y), b), where(new, smaller(c, z), c),
+        where(new, larger(d, x), d), where(new, larger(e, y), e), where(new, larger(f, z), f),
+    )  # fmt: skip
 
 
 @rule
-def _widen(extremes, axis, new, cell):  # type: ignore[no-untyped-def]
-    low, high = load(extremes, axis * LANES), load(extremes, (axis + 3) * LANES)
-    store(extremes, axis * LANES, where(new, smaller(low, cell), low))
-    store(extremes, (axis + 3) * LANES, where(new, larger(high, cell), high))
+def _nothing():  # type: ignore[no-untyped-def]
+    far, near = fill(FARTHEST), fill(NOWHERE)
+    return far, far, far, near, near, near
 
 
 @rule
-def _begin(codes, extremes):  # type: ignore[no-untyped-def]
-    """Forget what was entered before: the grid may have been emptied since."""
-    codes[:] = NOWHERE
-    extremes[: 3 * LANES] = FARTHEST
-    extremes[3 * LANES :] = NOWHERE
-
-
-@rule
-def _end(extremes, box):  # type: ignore[no-untyped-def]
-    """Widen ``box`` by all that was entered."""
-    for k in range(3 * LANES):
-        box[k // LANES] = min(box[k // LANES], extremes[k])
-        box[3 + k // LANES] = max(box[3 + k // LANES], extremes[3 * LANES + k])
+def _widen(box, extremes, room):  # type: ignore[no-untyped-def]
+    """Widen ``box`` to ``extremes``; ``room`` (LANES,) is working memory."""
+    for k in range(6):
+        store(room, 0, extremes[k])
+        for lane in range(LANES):
+            box[k] = min(box[k], room[lane]) if k < 3 else max(box[k], room[lane])
 
 
 @bare_kernel
-def mark_points(points, T, limits, shape, shift, counting, codes, extremes, few, box, cells):  # type: ignore[no-untyped-def]
+def mark_points(points, T, limits, shape, shift, counting, codes, new, few, box, cells):  # type: ignore[no-untyped-def]
     """Enter ``points`` (N, 3) into the flat grid ``cells``, and widen ``box``, see :func:`new_box`.
 
-    ``codes`` (LANES,), ``extremes`` and ``few`` are working memory, see :class:`Marking`.
+    ``codes``, ``new`` and ``few`` are working memory, see :class:`Marking`.
     """
     xyz, m = points.reshape(-1), np.int32(shift)
-    _begin(codes, extremes)
-    left = fill(NOWHERE)
+    codes[:] = NOWHERE  # the grid may have been emptied since
+    left, extremes, count = fill(NOWHERE), _nothing(), 0
     for at in range(0, xyz.shape[0], 3 * LANES):
         if at + 3 * LANES <= xyz.shape[0]:
             px, py, pz = load_triples(xyz, at)
@@ -223,20 +228,27 @@ def mark_points(points, T, limits, shape, shift, counting, codes, extremes, few,
         z = add(
             fill(T[2, 3]), add(add(mul(fill(T[2, 0]), px), mul(fill(T[2, 1]), py)), mul(fill(T[2, 2]), pz))
         )
-        left = _mark(x, y, z, ALL, left, codes, 0, limits, shape, m, counting, extremes, cells)
-    _end(extremes, box)
+        left, extremes, count = _mark(
+            x, y, z, ALL, left, codes, 0, limits, shape, m, counting, extremes, new, count
+        )
+        if count > MOST_NEW:
+            _enter(new, count, counting, cells)
+            count = 0
+    _enter(new, count, counting, cells)
+    _widen(box, extremes, codes)
 
 
 @bare_kernel
 def mark_depth(  # type: ignore[no-untyped-def]
-    depth, first, last, column, row, t, limits, shape, shift, counting, codes, extremes, few, box, cells
+    depth, first, last, column, row, t, limits, shape, shift, counting, codes, new, few, box, cells
 ):
     """As :func:`mark_points`, for rows ``first`` to ``last`` (exclusive) of a depth image, see :class:`Rays`.
 
-    ``codes`` is as long as ``column``: a pixel's neighbours are the one before it and the one above.
+    A pixel's neighbours are the one before it, the one above, and the next to that.
     """
     flat, width, m = depth.reshape(-1), depth.shape[1], np.int32(shift)
-    _begin(codes, extremes)
+    codes[:] = NOWHERE
+    extremes, count = _nothing(), 0
     for v in range(first, last):
         left = fill(NOWHERE)
         for u in range(0, width, LANES):
@@ -252,8 +264,14 @@ def mark_depth(  # type: ignore[no-untyped-def]
             y = add(fill(t[1]), mul(far, add(load(column[1], u), fill(row[1, v]))))
             z = add(fill(t[2]), mul(far, add(load(column[2], u), fill(row[2, v]))))
             known = ~equal(raw, sub(raw, raw))
-            left = _mark(x, y, z, known, left, codes, u, limits, shape, m, counting, extremes, cells)
-    _end(extremes, box)
+            left, extremes, count = _mark(
+                x, y, z, known, left, codes, u, limits, shape, m, counting, extremes, new, count
+            )
+            if count > MOST_NEW:
+                _enter(new, count, counting, cells)
+                count = 0
+    _enter(new, count, counting, cells)
+    _widen(box, extremes, codes)
 
 
 @bare_kernel
@@ -273,23 +291,28 @@ class Marking:
     """The working memory of one thread that enters readings into a grid."""
 
     codes: npt.NDArray[np.int32]
-    extremes: npt.NDArray[np.int32]
+    new: npt.NDArray[np.int32]
     few_points: F32
     few_pixels: U16
 
     @classmethod
     def of(cls, width: int) -> Marking:
         """Return memory for images as wide as that, and for points."""
-        codes, extremes = np.empty(_whole_vectors(width), np.int32), np.empty(6 * LANES, np.int32)
-        return cls(codes, extremes, np.empty(3 * LANES, np.float32), np.empty(LANES, np.uint16))
+        codes = np.empty(_whole_vectors(width) + LANES, np.int32)
+        return cls(
+            codes,
+            np.empty(MOST_NEW + 2 * LANES, np.int32),
+            np.empty(3 * LANES, np.float32),
+            np.empty(LANES, np.uint16),
+        )
 
     def for_points(self) -> tuple[npt.NDArray[Any], ...]:
         """Return what :func:`mark_points` needs."""
-        return self.codes[:LANES], self.extremes, self.few_points
+        return self.codes[: 2 * LANES], self.new, self.few_points
 
     def for_depth(self, width: int) -> tuple[npt.NDArray[Any], ...]:
         """Return what :func:`mark_depth` needs for an image as wide as that, as wide as it was made for at most."""
-        return self.codes[: _whole_vectors(width)], self.extremes, self.few_pixels
+        return self.codes[: _whole_vectors(width) + LANES], self.new, self.few_pixels
 
 
 def _whole_vectors(width: int) -> int:

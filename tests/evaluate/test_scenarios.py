@@ -137,10 +137,8 @@ def test_a_missing_body_is_told(bodies: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_the_paper_s_scenarios_are_scored(capsys: pytest.CaptureFixture[str]) -> None:
-    small = ["--identities", "1", "--turns", "4", "--revolutions", "0.02"]
-    assert (
-        main(["eval", "static", "rotation", *small, "--limit", "static:recall=1", "centre_mean_m=0.03"]) == 0
-    )
+    command = ["eval", "static", "--identities", "1", "--turns", "4", "rotation", "--revolutions", "0.02"]
+    assert main([*command, "--limit", "static:recall=1", "centre_mean_m=0.03"]) == 0
     rows = capsys.readouterr().out.splitlines()
     assert rows[1].split()[:6] == ["static", "default", "alike", "4", "4", "4"]
     assert [row.split("  ")[0] for row in rows[1:6]] == [

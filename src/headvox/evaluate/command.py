@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     if argv and argv[0] == "compare":
         return _compare(argv[1:])
     parser = _parser()
-    args = parser.parse_args(argv)
+    args = parser.parse_intermixed_args(argv)
     try:
         return _report(args)
     except UsageError as error:
@@ -183,7 +183,7 @@ def _finders(
     finders = []
     for config in configs:
         finders.append(bare(config, stack))
-        if scenario.moving and not args.no_track:
+        if scenario.moving and scenario.length != 1 and not args.no_track:
             finders.append(tracked(config, tracker_config_of(args), stack))
     return finders
 

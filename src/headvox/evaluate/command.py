@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import sys
@@ -92,9 +91,7 @@ def _report(args: argparse.Namespace) -> int:
     rules = Rules(args.radius, args.clear, args.count_truncated)
     configs = [config_of(args)]
     configs += [replace(configs[0], cascade=name) for name in args.against]
-    made = _made(
-        configs, rules, args
-    )  # what is wrong with a cascade is told now, and what with the folder, too
+    made = _made(configs, rules, args)  # what is wrong with a cascade, or with the folder, is told now
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
     scores: list[Scores] = []
@@ -107,7 +104,7 @@ def _report(args: argparse.Namespace) -> int:
     report = Report(tuple(scores), made)
     if args.output is not None:
         _write(report, runs, rules, args.output)
-    print(json.dumps(_plain(report), indent=1, allow_nan=False) if args.json else _text(report, args.details))
+    print(report.to_json() if args.json else _text(report, args.details))
     missed = [line for limit in args.limit for line in limit.missed(report)]
     for line in missed:
         print(printable(f"headvox: limit missed: {line}"), file=sys.stderr)
@@ -141,7 +138,9 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
                 raise UsageError("peers needs --clouds FOLDER, with the four meshes of the paper's authors")
             made.append(around(args.clouds))
         else:
-            made.append(known.recording(Path(what)))
+            scenario = known.recording(Path(what))
+            is_known = scenario.name in [other.name for other in made]
+            made.append(replace(scenario, name=what) if is_known else scenario)
     if args.keep is not None:
         if len(made) != 1 or made[0].name not in ("two-cameras", "peers"):
             raise UsageError("--keep goes with exactly one of two-cameras and peers")
@@ -212,7 +211,7 @@ def _made(configs: Sequence[DetectorConfig], rules: Rules, args: argparse.Namesp
 
     from headvox.masks import load_cascade
 
-    return {
+    made = {
         "headvox": __version__,
         "python": platform.python_version(),
         "numpy": numpy.__version__,
@@ -220,23 +219,19 @@ def _made(configs: Sequence[DetectorConfig], rules: Rules, args: argparse.Namesp
         "machine": platform.machine(),
         "cores": os.cpu_count(),
         "rules": asdict(rules),
-        "settings": [] if args.heads else [asdict(config) for config in configs],
-        "tracker": None if args.heads or args.no_track else asdict(tracker_config_of(args)),
-        "tuned_on": {}
-        if args.heads
-        else {c.cascade: list(load_cascade(c.cascade).tuned_on) for c in configs},
     }
-
-
-def _plain(report: Report) -> dict[str, Any]:
-    return {"made": report.made, "scores": [asdict(scores) for scores in report.scores]}
+    if args.heads is None:  # else nobody knows
+        made["settings"] = [asdict(config) for config in configs]
+        made["tracker"] = None if args.no_track else asdict(tracker_config_of(args))
+        made["tuned_on"] = {c.cascade: list(load_cascade(c.cascade).tuned_on) for c in configs}
+    return made
 
 
 def _text(report: Report, details: bool) -> str:
     parts = [report.table()]
     if details:
         parts.append(report.details())
-    for cascade, tuned_on in report.made["tuned_on"].items():
+    for cascade, tuned_on in report.made.get("tuned_on", {}).items():
         words = tuned_on or ["not told"]
         parts.append("\n".join([f"{cascade} was tuned on", *(f"  {entry}" for entry in words)]))
     return "\n\n".join(part for part in parts if part)

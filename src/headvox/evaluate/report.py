@@ -25,14 +25,15 @@ class Report:
     made: dict[str, Any] = field(default_factory=dict)
     """Versions, settings, rules, and what each cascade was tuned on."""
 
+    def to_json(self) -> str:
+        """Return everything as JSON."""
+        content = {"format": FORMAT, "version": VERSION, "made": self.made}
+        return json.dumps(content | {"scores": [asdict(s) for s in self.scores]}, indent=1, allow_nan=False)
+
     def save(self, path: Path) -> None:
         """Write the report as JSON; what stood there stays until the new one is complete."""
-        text = json.dumps(
-            {"format": FORMAT, "version": VERSION, "made": self.made, "scores": [asdict(s) for s in self.scores]},
-            indent=1, allow_nan=False,
-        )  # fmt: skip
         unfinished = path.with_name(path.name + ".part")
-        unfinished.write_text(text + "\n", encoding="utf-8")
+        unfinished.write_text(self.to_json() + "\n", encoding="utf-8")
         os.replace(unfinished, path)
 
     @staticmethod

@@ -10,6 +10,7 @@ import functools
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import product
 
 import numpy as np
 
@@ -202,7 +203,12 @@ def condition_holds(amount: np.ndarray, cell, condition: Condition, voxel: float
     return round(condition.minimum * cells, 6) <= got <= round(condition.maximum * cells, 6)
 
 
-def gate(amount: np.ndarray, cascade: Cascade, voxel: float, odd: int = 0) -> np.ndarray:
+def is_candidate(cell, spacing: int, odd=(0, 0, 0)) -> bool:
+    x, y, z = ((c + o) % 2 for c, o in zip(cell, odd, strict=True))
+    return spacing == 1 or (spacing == 2 and (x + y + z) % 2 == 0) or (spacing == 4 and x == y == z)
+
+
+def gate(amount: np.ndarray, cascade: Cascade, voxel: float, odd=(0, 0, 0)) -> np.ndarray:
     """Return the voxels that pass every condition, in the order of x, y, z."""
     unit = 1 if cascade.counting else cascade.subdivision**3
     passed = [
@@ -210,7 +216,7 @@ def gate(amount: np.ndarray, cascade: Cascade, voxel: float, odd: int = 0) -> np
         for x in range(amount.shape[0])
         for y in range(amount.shape[1])
         for z in range(amount.shape[2])
-        if (not cascade.every_other or (x + y + z + odd) % 2 == 0)
+        if is_candidate((x, y, z), cascade.spacing, odd)
         and all(condition_holds(amount, (x, y, z), c, voxel, unit) for c in cascade.conditions)
     ]
     return np.array(passed, np.int32).reshape(-1, 3)
@@ -274,7 +280,9 @@ def names_in(tree) -> set[str]:
     return {tree[0]} | names_in(tree[2]) | names_in(tree[3])
 
 
-def score_by_stages(amount: np.ndarray, cell, cascade: Cascade, voxel: float, states=None) -> int:
+def score_by_stages(
+    amount: np.ndarray, cell, cascade: Cascade, voxel: float, states=None, judge=False
+) -> int:
     """Return the score in units of 1/1024. Without ``states`` the first stage that needs them ends it."""
     seeing = {group.name for group in cascade.groups if group.channel != "occupied"}
     known = {}
@@ -285,7 +293,7 @@ def score_by_stages(amount: np.ndarray, cell, cascade: Cascade, voxel: float, st
         return known[name]
 
     score = 0
-    for stage in cascade.stages:
+    for stage in cascade.judge if judge else cascade.stages:
         needed = {name.rsplit(".", 1)[0] for tree in stage.trees for name in names_in(tree)}
         if states is None and needed & seeing:
             break
@@ -356,12 +364,12 @@ def count_seen(images, lattice: Lattice, cells, boxes) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------------------- suppress
 
 
-def suppress(cells: np.ndarray, scores: np.ndarray, least: int) -> np.ndarray:
+def suppress(cells: np.ndarray, scores: np.ndarray, least: int, reach: int = 1) -> np.ndarray:
     """Return the candidates that beat every neighbour; of equal neighbours the first wins."""
     number = {tuple(cell): i for i, cell in enumerate(cells.tolist())}
     peaks = []
     for (x, y, z), i in number.items():
-        around = [(x + a, y + b, z + c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)]
+        around = [(x + a, y + b, z + c) for a, b, c in product(range(-reach, reach + 1), repeat=3)]
         others = [number[cell] for cell in around if cell in number and cell != (x, y, z)]
         if scores[i] >= least and all((scores[i], -i) > (scores[j], -j) for j in others):
             peaks.append(i)
@@ -427,6 +435,17 @@ def fit_spheres(cells: np.ndarray, peaks, voxel: float, subdivision: int) -> np.
 # ----------------------------------------------------------------------------------------------------------- all of it
 
 
+def best_about(amount: np.ndarray, cells, cascade: Cascade, voxel: float) -> tuple[np.ndarray, list[int]]:
+    """Return for each peak the voxel about it that the judge likes best, and its score; no voxel twice."""
+    best = {}
+    for cell in cells.tolist():
+        about = [tuple(cell[k] + d[k] for k in range(3)) for d in product((-1, 0, 1), repeat=3)]
+        scores = [score_by_stages(amount, c, cascade, voxel, judge=True) for c in about]
+        if max(scores) > DROPPED:
+            best.setdefault(about[scores.index(max(scores))], max(scores))
+    return np.array(list(best), np.int32).reshape(-1, 3), list(best.values())
+
+
 @dataclass
 class Found:
     centres: np.ndarray
@@ -445,28 +464,30 @@ def detect(frame: Frame, cascade: Cascade, region: Region, min_score: float | No
     for image in frame.depths:
         grid.enter_depth(image)
     amount = grid.amounts(counting)
-    candidates = gate(amount, cascade, voxel, sum(round(v / voxel) for v in lattice.origin))
+    candidates = gate(amount, cascade, voxel, [round(v / voxel) for v in lattice.origin])
     if cascade.votes is not None:
         scores = [score_by_votes(amount, cell, cascade.votes, voxel)[0] for cell in candidates]
     else:
         scores = [score_by_stages(amount, cell, cascade, voxel) for cell in candidates]
     scores = np.array(scores, np.int64)
-    peaks = suppress(candidates, scores, DROPPED + 1)
+    peaks = suppress(candidates, scores, DROPPED + 1, 2 if cascade.spacing == 4 else 1)
 
     seeing = {group.name for group in cascade.groups if group.channel != "occupied"}
     asks = {
-        n.rsplit(".", 1)[0] for stage in cascade.stages for tree in stage.trees for n in names_in(tree)
+        n.rsplit(".", 1)[0] for stage in cascade.judge for tree in stage.trees for n in names_in(tree)
     } & seeing
     sees = bool(asks) and bool(frame.depths) and not frame.clouds
-    if sees:
-        states = States(frame.depths, lattice)
-        for peak in peaks:
-            scores[peak] = score_by_stages(amount, candidates[peak], cascade, voxel, states)
+    cells, scores = candidates[peaks], scores[peaks]
+    if cascade.judge:
+        cells, scores = best_about(amount, cells, cascade, voxel)
+        if sees:
+            states = States(frame.depths, lattice)
+            scores = [score_by_stages(amount, cell, cascade, voxel, states, judge=True) for cell in cells]
+    scores = np.array(scores, np.int64)
     if min_score is None:
         min_score = cascade.min_score if sees or not asks else cascade.min_score_occupied
-    peaks = [peak for peak in peaks if scores[peak] >= min_score * SCORE_UNIT]
-
-    cells = candidates[peaks]
+    high = scores >= min_score * SCORE_UNIT
+    cells, scores = cells[high], scores[high]
     spheres = fit_spheres(grid.counts if counting else grid.bits, cells, voxel, cascade.subdivision)
     middles = (cells + 0.5) * voxel + np.array(lattice.origin)
     placed = [c.T_world_sensor for c in frame.clouds if c.T_world_sensor is not None]
@@ -475,10 +496,10 @@ def detect(frame: Frame, cascade: Cascade, region: Region, min_score: float | No
     centres = middles + spheres[:, :3]
     if len(origins):
         centres[:, 2] -= 0.0135
-    kept = suppress_overlaps(centres, scores[peaks], 0.18)
+    kept = suppress_overlaps(centres, scores, 0.18)
     return Found(
         centres[kept],
-        [scores[peaks][k] / SCORE_UNIT for k in kept],
+        [scores[k] / SCORE_UNIT for k in kept],
         [spheres[k, 3] for k in kept],
         len(candidates),
     )

@@ -72,7 +72,17 @@ name = "b"
 keep = -0.6001
 trees = [["core.sum", 0.1, 0.2, ["near.high", 0.15, 0.3, -0.5]], ["near.sum", 0.1, -0.3, 0.3]]
 [[stage]]
+name = "again"
+at = "peaks"
+keep = 0.2
+trees = [
+  ["near.sum", 0.05, -1.0, ["near.min", 0.0, 0.1, 0.77]],
+  ["near.max", 0.3, 0.3, ["near.low", 0.02, -0.2, 0.4]],
+  ["core.sum", 0.1, 0.2, ["near.high", 0.15, 0.3, -0.5]],
+]
+[[stage]]
 name = "c"
+at = "peaks"
 trees = [["free.sum", 0.3, -0.7, ["free.min", 0.1, 0.2, 0.5]], ["shade.sum", 0.2, -0.3, ["free.max", 0.9, 0.1, 0.6]]]
 """
 

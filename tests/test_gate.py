@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import product
 
 import naive
 import numpy as np
@@ -195,18 +196,20 @@ def test_a_million_points_in_one_cell():
     assert len(same_survivors(cells, cascade_with(gate, 1, "count"))) == 27
 
 
-@pytest.mark.parametrize("odd", [0, 1])
-def test_every_other_voxel_equals_the_naive_twin_and_the_two_halves_are_the_whole(odd):
+@pytest.mark.parametrize("spacing", [2, 4])
+def test_some_voxels_equal_the_naive_twin_and_the_lattices_together_are_the_whole(spacing):
     rng = np.random.default_rng(7)
     cells = (rng.random((9, 8, 11)) < 0.15).astype(np.uint8) * rng.integers(0, 256, (9, 8, 11)).astype(
         np.uint8
     )
     condition = Condition(Group("some", (Box((0, 0, 0.02), (0.06, 0.06, 0.06)),)), 0, 0.01, 1.0)
-    half = Cascade("c", "c", 0.02, 2, False, (condition,), None, (), (), 0.0, 0.0, (), every_other=True)
-    S, gate = integral_volume(cells), compile_cascade(half).gate
-    found = pass_gate(S, gate, odd)
-    np.testing.assert_array_equal(found, naive.gate(naive.weights(cells), half, 0.02, odd))
-    whole = pass_gate(S, compile_cascade(replace(half, every_other=False)).gate)
-    both = np.concatenate([found, pass_gate(S, gate, 1 - odd)])
-    assert 0 < len(found) < len(whole)
-    assert sorted(map(tuple, both.tolist())) == sorted(map(tuple, whole.tolist()))
+    some = Cascade("c", "c", 0.02, 2, False, (condition,), None, (), (), 0.0, 0.0, (), spacing=spacing)
+    S, gate = integral_volume(cells), compile_cascade(some).gate
+    whole = pass_gate(S, compile_cascade(replace(some, spacing=1)).gate)
+    together = []
+    for odd in product((0, 1), repeat=3):
+        found = pass_gate(S, gate, odd)
+        np.testing.assert_array_equal(found, naive.gate(naive.weights(cells), some, 0.02, odd))
+        assert 0 < len(found) < len(whole)
+        together += map(tuple, found.tolist())
+    assert sorted(together) == sorted([*map(tuple, whole.tolist())] * (8 // spacing))

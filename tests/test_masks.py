@@ -363,18 +363,21 @@ def test_weights_that_no_integral_volume_can_hold_are_refused():
 def test_leaves_only():
     """A cascade that looks at nothing is pointless, but no accident."""
     stage = replace(parse_cascade(scenes.STAGES, "x").stages[0], trees=(0.5,))
-    cascade = replace(parse_cascade(scenes.STAGES, "x"), conditions=(), groups=(), stages=(stage,))
+    small = parse_cascade(scenes.STAGES, "x")
+    cascade = replace(small, conditions=(), groups=(), stages=(stage,), judge=())
     assert compile_cascade(cascade).largest_sum >= 1
 
 
 def test_sees_tells_whether_a_used_group_looks_at_another_channel():
     cascade = parse_cascade(scenes.STAGES, "x")
     assert cascade.sees
-    assert not replace(cascade, stages=cascade.stages[:2]).sees
+    assert not replace(cascade, judge=cascade.judge[:1]).sees
     assert compile_cascade(cascade).stages.occupied_stages == 2
-    assert compile_cascade(replace(cascade, stages=cascade.stages[:2])).stages.occupied_stages == 2
+    assert compile_cascade(cascade).judge.occupied_stages == 1
+    assert compile_cascade(replace(cascade, judge=cascade.judge[:1])).judge.occupied_stages == 1
 
 
 def test_groups_that_no_tree_asks_for_are_left_out():
     compiled = compile_cascade(parse_cascade(scenes.STAGES, "x"))
-    assert len(compiled.stages.group_channel) == 4
+    assert len(compiled.stages.group_channel) == 2
+    assert len(compiled.judge.group_channel) == 4

@@ -65,7 +65,12 @@ name = "a"
 keep = -2.0
 trees = [["../../$ring.sum", 0.15, -1.0, ["../../$ring.min", 0.05, 0.1, 1.0]]]
 [[stage]]
+name = "judge"
+at = "peaks"
+trees = [0.0]
+[[stage]]
 name = "b"
+at = "peaks"
 trees = [["around.sum", 0.5, 2.0, 0.5], ["around.max", 0.5, 0.0, ["../../$ring.sum", 0.3, 0.5, 0.0]]]
 """
 

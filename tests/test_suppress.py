@@ -7,14 +7,15 @@ from headvox.suppress import suppress, suppress_overlaps
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("values", [1, 3, 1000])
-def test_equals_the_naive_twin(seed, values):
+@pytest.mark.parametrize("reach", [1, 2])
+def test_equals_the_naive_twin(seed, values, reach):
     rng = np.random.default_rng(seed)
     shape = (7, 6, 8)
     cells = np.argwhere(rng.random(shape) < rng.choice([0.05, 0.3, 1.0])).astype(np.int32)
     scores = rng.integers(-values, values, len(cells))
     for least in (-(2**40) + 1, 0):
-        peaks = suppress(cells, scores, least, shape)
-        np.testing.assert_array_equal(peaks, naive.suppress(cells, scores, least))
+        peaks = suppress(cells, scores, least, shape, reach)
+        np.testing.assert_array_equal(peaks, naive.suppress(cells, scores, least, reach))
 
 
 def test_no_candidate_and_one_candidate():

@@ -82,14 +82,16 @@ def test_stages_equal_the_naive_twin(seed, voxel, seeing):
     grid[3:6] = 0
     cells = some_cells(rng, grid.shape, 80)
     compiled = compile_cascade(SMALL, voxel)
+    stages = compiled.judge if seeing else compiled.stages
     states = MadeUp() if seeing else None
     seen = None
     if seeing:
-        boxes, _ = seen_boxes(compiled.stages)
+        boxes, _ = seen_boxes(stages)
         seen = np.array([[naive.count_in(states, naive.about(c, b)) for b in boxes] for c in cells], np.int32)
-    wanted = [naive.score_by_stages(naive.weights(grid), cell, SMALL, voxel, states) for cell in cells]
+    amount = naive.weights(grid)
+    wanted = [naive.score_by_stages(amount, cell, SMALL, voxel, states, seeing) for cell in cells]
     for S in volumes(grid, compiled):
-        assert score_by_stages(S, cells, compiled.stages, seen).tolist() == wanted
+        assert score_by_stages(S, cells, stages, seen).tolist() == wanted
     assert len(set(wanted)) > 2
     assert DROPPED in wanted
 

@@ -51,23 +51,28 @@ def _holds(flat, at, corners, weights, start, rank, limits, i):  # type: ignore[
 
 @bare_kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S, region, first, last, weights, start, rank, limits, every_other, odd, corners, survivors
+    S, region, first, last, weights, start, rank, limits, spacing, odd, corners, survivors
 ):
     """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many.
 
     ``region`` is y0 y1 z0 z1: the voxels of a slice that count. S has margins about them, see
-    :func:`headvox.integral.shape_with_margins`. With ``every_other``, only voxels whose x + y + z + ``odd`` is even
-    count. ``corners`` are those of the gate's boxes. Counting goes on past the end of ``survivors``, so that the caller
-    can tell how many did not fit.
+    :func:`headvox.integral.shape_with_margins`. With ``odd`` (3,) added to x, y and z, all voxels count (``spacing``
+    1), those whose x + y + z is even (2), or those whose x, y and z are all even or all odd (4). ``corners`` are those
+    of the gate's boxes. Counting goes on past the end of ``survivors``, so that the caller can tell how many did not
+    fit.
     """
     flat = S.reshape(-1)
     bottom, height = region[2], region[3] - region[2]
     found = 0
     for x in range(first, last):
         for y in range(region[0], region[1]):
+            across = x + y + odd[0] + odd[1]
+            if spacing == 4 and across & 1:
+                continue
+            up = (across if spacing == 2 else x + odd[0]) + bottom + odd[2]
             column = (x * S.shape[1] + y) * S.shape[2] + bottom
             for z in range(0, height, LANES):
-                alive = EVEN << np.uint32((x + y + bottom + odd) & 1) if every_other else ALL
+                alive = ALL if spacing == 1 else EVEN << np.uint32(up & 1)
                 for i in range(np.uint64(rank.shape[0])):
                     alive &= _holds(flat, column + z, corners, weights, start, rank, limits, i)
                     if alive == 0:
@@ -110,10 +115,10 @@ def gate_tables(gate: CompiledGate, sum_type: np.dtype[Any]) -> tuple[npt.NDArra
     return gate.weights, gate.start, gate.rank, limits
 
 
-def pass_gate(S: Integral, gate: CompiledGate, odd: int = 0) -> npt.NDArray[np.int32]:
+def pass_gate(S: Integral, gate: CompiledGate, odd: npt.ArrayLike = (0, 0, 0)) -> npt.NDArray[np.int32]:
     """Return the voxels (n, 3) of the integral volume ``S`` that pass, in the order of x, y, z.
 
-    ``odd`` is that of the lattice, for a gate that looks at every other voxel only.
+    ``odd`` (3,) is that of the lattice, for a gate that does not look at every voxel.
     """
     reach = box_reach(gate.boxes)
     longer = with_margins(S, reach)
@@ -123,7 +128,7 @@ def pass_gate(S: Integral, gate: CompiledGate, odd: int = 0) -> npt.NDArray[np.i
     set_corners(longer, gate.boxes, corners)
     region = np.array([low[1], high[1], low[2], high[2]])
     arguments = (longer, region, low[0], high[0], *gate_tables(gate, S.dtype))
-    arguments += (gate.every_other, odd + low.sum(), corners)
+    arguments += (gate.spacing, np.asarray(odd) + low, corners)
     count = gate_columns(*arguments, np.empty((0, 3), np.int32))
     survivors = np.empty((count, 3), np.int32)
     gate_columns(*arguments, survivors)

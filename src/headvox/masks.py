@@ -37,6 +37,7 @@ CHANNELS = ("occupied", "empty", "hidden")
 # smallest, 3rd smallest, 3rd largest, largest, all together
 STATISTICS = ("min", "low", "high", "max", "sum")
 SCORE_UNIT = 1024
+SPACINGS = {"all": 1, "every other": 2, "every fourth": 4}
 MAX_FILE_BYTES = 8 << 20
 MAX_EXTENT_M = 2.0
 MAX_SEEN_CELLS = 1 << 20
@@ -122,14 +123,16 @@ class Cascade:
     min_score: float
     min_score_occupied: float
     tuned_on: tuple[str, ...]
-    every_other: bool = False
-    """Whether only every other voxel is a candidate, as the black squares of a chess board are."""
+    spacing: int = 1
+    """1: every voxel is a candidate; 2: every other, as the black squares of a chess board are; 4: every fourth."""
+    judge: tuple[Stage, ...] = ()
+    """Stages that score the voxels about the peaks of ``stages`` anew."""
 
     @property
     def sees(self) -> bool:
         """Whether some stage asks what the sensors saw to be empty or hidden."""
         used = {
-            name.rpartition(".")[0] for stage in self.stages for tree in stage.trees for name, _ in cuts(tree)
+            name.rpartition(".")[0] for stage in self.judge for tree in stage.trees for name, _ in cuts(tree)
         }
         return any(group.channel != "occupied" for group in self.groups if group.name in used)
 
@@ -336,15 +339,20 @@ class _Reader:
             self.tree(value[3], features, where, depth + 1),
         )
 
-    def stage(self, value: object, features: set[str]) -> Stage:
-        table = self.table(value, "stage", {"name", "keep", "trees"})
+    def stage(self, value: object, features: set[str]) -> tuple[Stage, bool]:
+        """Return a stage, and whether it is one of the judge's."""
+        table = self.table(value, "stage", {"name", "at", "keep", "trees"})
         name = self.text(table.get("name"), "stage.name")
+        at = self.text(table.get("at", "candidates"), f"stage {name}.at")
+        if at not in ("candidates", "peaks"):
+            raise self.error(f"stage {name}.at", '"candidates" or "peaks"', at)
         trees = self.items(table.get("trees"), f"stage {name}.trees")
-        return Stage(
+        stage = Stage(
             name,
             self.number(table.get("keep", -math.inf), f"stage {name}.keep", -math.inf, math.inf),
             tuple(self.tree(tree, features, f"stage {name}.trees") for tree in trees),
         )
+        return stage, at == "peaks"
 
     def cascade(self, value: dict[str, Any]) -> Cascade:
         known = {"format", "version", "name", "summary", "voxel_m", "subdivision", "occupancy", "gate"}
@@ -376,19 +384,23 @@ class _Reader:
             raise self.error(
                 "gate", "a condition with min above 0, as only places near points are searched", "none"
             )
-        stages = tuple(self.stage(entry, features) for entry in self.items(table.get("stage", []), "stage"))
+        every = [self.stage(entry, features) for entry in self.items(table.get("stage", []), "stage")]
+        stages = tuple(stage for stage, at_peaks in every if not at_peaks)
+        judge = tuple(stage for stage, at_peaks in every if at_peaks)
+        if every and not stages:
+            raise self.error("stage", 'at least one stage at "candidates"', "none")
         blind = {group.name for group in groups if group.channel == "occupied"}
-        for tree in stages[0].trees if stages else ():
-            for feature, _ in cuts(tree):
-                if feature.rpartition(".")[0] not in blind:
-                    # Neighbours compete by what is occupied; only the winners are looked at through the cameras.
-                    raise self.error(
-                        f"stage {stages[0].name}", 'only "occupied" groups, as it is the first', feature
-                    )
+        for stage in (*stages, *judge[:1]):
+            for tree in stage.trees:
+                for feature, _ in cuts(tree):
+                    if feature.rpartition(".")[0] not in blind:
+                        # Neighbours compete by what is occupied; only the winners are looked at through the cameras.
+                        where = "as neighbours compete by it"
+                        raise self.error(f"stage {stage.name}", f'only "occupied" groups, {where}', feature)
         min_score = self.number(table.get("min_score"), "min_score")
         candidates = self.text(table.get("candidates", "all"), "candidates")
-        if candidates not in ("all", "every other"):
-            raise self.error("candidates", '"all" or "every other"', candidates)
+        if candidates not in SPACINGS:
+            raise self.error("candidates", " or ".join(f'"{name}"' for name in SPACINGS), candidates)
         return Cascade(
             name=self.text(table.get("name"), "name"),
             summary=self.text(table.get("summary"), "summary"),
@@ -404,7 +416,8 @@ class _Reader:
             tuned_on=tuple(
                 self.text(entry, "tuned_on") for entry in self.items(table.get("tuned_on", []), "tuned_on")
             ),
-            every_other=candidates == "every other",
+            spacing=SPACINGS[candidates],
+            judge=judge,
         )
 
 
@@ -462,7 +475,7 @@ class CompiledGate:
     rank: I32
     low: I64
     high: I64
-    every_other: bool
+    spacing: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -512,6 +525,7 @@ class CompiledCascade:
     gate: CompiledGate
     votes: CompiledVotes | None
     stages: CompiledStages | None
+    judge: CompiledStages | None
     largest_sum: int
     """Volume in voxel parts of the largest thing that is summed: tells which integer type an integral volume needs."""
 
@@ -522,7 +536,8 @@ def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledC
     unit = 1 if cascade.counting else cascade.subdivision**3
     gate = _compile_gate(cascade, voxel, unit)
     votes = _compile_votes(cascade.votes, voxel) if cascade.votes else None
-    stages = _compile_stages(cascade, voxel, unit) if cascade.stages else None
+    stages = _compile_stages(cascade, cascade.stages, voxel, unit) if cascade.stages else None
+    judge = _compile_stages(cascade, cascade.judge, voxel, unit) if cascade.judge else None
     # The gate adds up the boxes of a condition in the type of the volume, signed; stage 2 adds up in 64 bits.
     sums = [
         2
@@ -534,8 +549,7 @@ def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledC
     tables = [gate.boxes]
     if votes:
         tables += [votes.boxes, votes.pairs.reshape(-1, 6)]
-    if stages:
-        tables.append(stages.boxes)
+    tables += [part.boxes for part in (stages, judge) if part]
     sums += [volume(box[None]) for table in tables for box in table]
     largest = max(sums, default=1) * unit
     if largest > 0xFFFFFFFF:
@@ -543,7 +557,7 @@ def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledC
             f"Cascade {cascade.name}: in voxels of {voxel:g} m a condition of its gate outgrows 32 bits.",
             "Make its boxes smaller or fewer, or their weights less.",
         )
-    return CompiledCascade(cascade, voxel, gate, votes, stages, largest)
+    return CompiledCascade(cascade, voxel, gate, votes, stages, judge, largest)
 
 
 def _box_table(boxes: list[list[int]]) -> I32:
@@ -583,7 +597,7 @@ def _compile_gate(cascade: Cascade, voxel: float, unit: int) -> CompiledGate:
         np.array(ranks, dtype=np.int32),
         np.array(lows, dtype=np.int64),
         np.array(highs, dtype=np.int64),
-        cascade.every_other,
+        cascade.spacing,
     )
 
 
@@ -611,8 +625,8 @@ def _compile_votes(votes: Votes, voxel: float) -> CompiledVotes:
     )
 
 
-def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages:
-    groups = _groups_by_first_use(cascade)
+def _compile_stages(cascade: Cascade, stages: tuple[Stage, ...], voxel: float, unit: int) -> CompiledStages:
+    groups = _groups_by_first_use(cascade.groups, stages)
     index = {group.name: g for g, (group, _) in enumerate(groups)}
     sizes: dict[str, float] = {}
     boxes: list[list[int]] = []
@@ -652,12 +666,12 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
 
     roots: list[tuple[int, int]] = []
     stage_trees = [0]
-    for stage in cascade.stages:
+    for stage in stages:
         roots += [add(tree) for tree in stage.trees]
         stage_trees.append(len(roots))
     channel = [CHANNELS.index(group.channel) for group, _ in groups]
     first = [stage for _, stage in groups]
-    count = len(cascade.stages)
+    count = len(stages)
     seeing = [stage for (group, stage) in groups if group.channel != "occupied"]
     return CompiledStages(
         _box_table(boxes),
@@ -668,17 +682,17 @@ def _compile_stages(cascade: Cascade, voxel: float, unit: int) -> CompiledStages
         np.array([depth for _, depth in roots], dtype=np.int32),
         np.array([0, *(sum(f <= s for f in first) for s in range(count))], dtype=np.int32),
         np.array(stage_trees, dtype=np.int32),
-        np.array([-_floor(-stage.keep * SCORE_UNIT) for stage in cascade.stages], dtype=np.int64),
+        np.array([-_floor(-stage.keep * SCORE_UNIT) for stage in stages], dtype=np.int64),
         min(seeing, default=count),
     )
 
 
-def _groups_by_first_use(cascade: Cascade) -> list[tuple[Group, int]]:
+def _groups_by_first_use(groups: tuple[Group, ...], stages: tuple[Stage, ...]) -> list[tuple[Group, int]]:
     """Return the groups that some tree asks for, in the order of the first stage that does, with that stage."""
     first: dict[str, int] = {}
-    for s, stage in enumerate(cascade.stages):
+    for s, stage in enumerate(stages):
         for tree in stage.trees:
             for name, _ in cuts(tree):
                 first.setdefault(name.rpartition(".")[0], s)
-    used = [(group, first[group.name]) for group in cascade.groups if group.name in first]
+    used = [(group, first[group.name]) for group in groups if group.name in first]
     return sorted(used, key=lambda pair: pair[1])

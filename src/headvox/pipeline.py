@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,10 @@ from headvox.fuse import Region
 from headvox.gate import candidate_reach, gate_columns, gate_tables
 from headvox.integral import box_reach, integrate, set_corners, shape_with_margins
 from headvox.kernels import Threads
-from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
+from headvox.masks import SCORE_UNIT, CompiledStages, compile_cascade, load_cascade
 from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
 from headvox.simd import LANES
-from headvox.suppress import local_maxima, suppress_overlaps
+from headvox.suppress import PEAK_REACH, local_maxima, suppress_overlaps
 from headvox.visibility import camera_table, cells_of, count_states, look_about
 from headvox.vote import DROPPED, StageTables, seen_boxes, vote_masks, vote_stages
 from headvox.voxelize import (
@@ -42,6 +43,8 @@ I64 = npt.NDArray[np.int64]
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
 SAME_HEAD_M = 0.18
 MOST_PEAKS = 256
+AROUND = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
+"""A voxel and its neighbours."""
 
 
 class Detector:
@@ -110,9 +113,9 @@ class Detector:
         clock.done("vote")
         peaks = self._suppress(S, survivors, scores, memory)
         clock.done("suppress")
-        peaks, scores, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
+        cells, scores, peaks, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
         clock.done("judge")
-        heads = self._refine(frame, survivors[peaks], scores[peaks], peaks, least, memory)
+        heads = self._refine(frame, cells, scores, peaks, least, memory)
         clock.done("refine")
         return heads
 
@@ -186,7 +189,7 @@ class Detector:
         parts = self._threads.count
         low, high = candidates[:3] - memory.first, candidates[3:] - memory.first + 1
         region = np.array([low[1], high[1], low[2], high[2]])
-        odd = memory.lattice.odd + int(memory.first.sum())
+        odd = memory.lattice.odd + memory.first
         set_corners(S, self.cascade.gate.boxes, memory.gate_corners)
         found = [0] * parts
 
@@ -198,7 +201,7 @@ class Detector:
                 low[0] + begin,
                 low[0] + end,
                 *memory.gate,
-                self.cascade.gate.every_other,
+                self.cascade.gate.spacing,
                 odd,
             )
             found[part] = gate_columns(*arguments, memory.gate_corners, memory.survivors[part])
@@ -214,84 +217,101 @@ class Detector:
     def _vote(self, S: npt.NDArray[Any], survivors: I32, memory: _Memory) -> I64:
         memory.make_room(len(survivors))
         scores, parts = memory.scores[: len(survivors)], self._threads.count
-        votes, stages = self.cascade.votes, self.cascade.stages
-        if stages is not None:
-            set_corners(S, stages.boxes, memory.corners)
+        votes = self.cascade.votes
+        if memory.search is not None:
+            self._score(S, survivors, memory.unseen, memory.search, memory, scores)
+        elif votes is not None:
+            table = (votes.boxes, votes.weights, votes.start, votes.masks, votes.pairs)
+
+            def vote(part: int) -> None:
+                low, high = _share(len(survivors), part, parts)
+                limits = (votes.asymmetry_cost, votes.min_votes)
+                vote_masks(S, survivors, low, high, *table, *limits, scores, memory.yaws)
+
+            self._threads.run(vote, [(part,) for part in range(parts)])
+        return scores
+
+    def _score(
+        self, S: npt.NDArray[Any], cells: I32, seen: I32, stages: _Stages, memory: _Memory, scores: I64,
+        all_stages: bool = False,
+    ) -> None:  # fmt: skip
+        """Write the score of each of ``cells`` by ``stages``; by those that ask nothing of the cameras, if not all."""
+        parts, compiled = self._threads.count, stages.compiled
+        last = len(compiled.stage_keep) if all_stages else compiled.occupied_stages
+        set_corners(S, compiled.boxes, stages.corners)
 
         def score(part: int) -> None:
-            low, high = _share(len(survivors), part, parts)
-            if votes is not None:
-                vote_masks(
-                    S, survivors, low, high, votes.boxes, votes.weights, votes.start, votes.masks, votes.pairs,
-                    votes.asymmetry_cost, votes.min_votes, scores, memory.yaws,
-                )  # fmt: skip
-            elif stages is not None:
-                vote_stages(
-                    S, survivors, memory.seen, low, high, stages.occupied_stages, *memory.tables,
-                    memory.corners, memory.alive, *memory.stages[part], scores,
-                )  # fmt: skip
+            low, high = _share(len(cells), part, parts)
+            vote_stages(
+                S, cells, seen, low, high, last, *stages.tables, stages.corners, memory.alive, *stages.memory[part],
+                scores,
+            )  # fmt: skip
 
         self._threads.run(score, [(part,) for part in range(parts)])
-        return scores
 
     def _suppress(self, S: npt.NDArray[Any], survivors: I32, scores: I64, memory: _Memory) -> I64:
         shape = tuple(n - 1 for n in S.shape)
         index = memory.index[: math.prod(shape)].reshape(shape)
-        peaks = memory.peaks[: local_maxima(survivors, scores, DROPPED + 1, index, memory.peaks)]
+        reach = PEAK_REACH[self.cascade.gate.spacing]
+        peaks = memory.peaks[: local_maxima(survivors, scores, DROPPED + 1, reach, index, memory.peaks)]
         if len(peaks) > MOST_PEAKS:  # a frame of noise: what follows must not take forever
             peaks = np.sort(peaks[np.argsort(-scores[peaks], kind="stable")[:MOST_PEAKS]])
         return peaks
 
     def _judge(
-        self,
-        frame: Frame,
-        S: npt.NDArray[Any],
-        survivors: I32,
-        scores: I64,
-        peaks: I64,
-        memory: _Memory,
+        self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: _Memory,
         expected: Expected | None,
-    ) -> tuple[I64, I64, int]:
-        """Let the peaks through that reach the cascade's threshold, after a look at what the cameras saw empty.
+    ) -> tuple[I32, I64, I64, int]:  # fmt: skip
+        """Look closer at the peaks, and let those through that reach the cascade's threshold.
 
-        Returned are the peaks, the scores of all survivors, and the threshold, in steps of the score.
+        Returned are their cells, their scores, which of the peaks they were, and the threshold, in steps of the score.
         """
-        cascade, stages = self.cascade.source, self.cascade.stages
-        sees = stages is not None and len(memory.offsets) > 0 and len(frame.depths) > 0 and not frame.clouds
-        if sees and stages is not None and len(peaks):
-            cells = survivors[peaks]
-            states = np.zeros((len(cells), len(memory.offsets)), np.uint8)
-            in_lattice = cells + memory.first.astype(np.int32)
-            for image in frame.depths:
-                look_about(
-                    image.depth, camera_table(image, memory.lattice), in_lattice, memory.offsets, states
-                )
-            seen = np.empty((len(cells), len(memory.offset_start) - 1, 2), np.int32)
-            count_states(states, memory.offset_start, seen)
-            judged = np.empty(len(cells), np.int64)
-            vote_stages(
-                S,
-                cells,
-                seen,
-                0,
-                len(cells),
-                len(stages.stage_keep),
-                *memory.tables,
-                memory.corners,
-                memory.alive,
-                *memory.stages[0],
-                judged,
-            )
-            scores[peaks] = judged
-        least = self.config.min_score
+        cells, scores, judge = survivors[peaks], scores[peaks], memory.judge
+        sees = self.cascade.source.sees and len(frame.depths) > 0 and not frame.clouds
+        if judge is not None and len(cells):
+            cells, scores, found = self._best_about(S, cells, judge, memory)
+            peaks = peaks[found]
+            if sees and len(cells):
+                scores = self._look_about(frame, S, cells, judge, memory)
+        cascade, least = self.cascade.source, self.config.min_score
         if least is None:
-            least = cascade.min_score if sees or not memory.sees else cascade.min_score_occupied
+            least = cascade.min_score if sees or not cascade.sees else cascade.min_score_occupied
         threshold = math.ceil(least * SCORE_UNIT)
-        kept = scores[peaks] >= threshold
+        kept = scores >= threshold
         if expected is not None and len(expected):
-            weaker = scores[peaks] >= threshold - math.floor(self.config.score_slack * SCORE_UNIT)
-            kept |= weaker & self._is_expected(survivors[peaks], expected, memory)
-        return peaks[kept], scores, threshold
+            weaker = scores >= threshold - math.floor(self.config.score_slack * SCORE_UNIT)
+            kept |= weaker & self._is_expected(cells, expected, memory)
+        return cells[kept], scores[kept], peaks[kept], threshold
+
+    def _best_about(
+        self, S: npt.NDArray[Any], cells: I32, judge: _Stages, memory: _Memory
+    ) -> tuple[I32, I64, I64]:
+        """Move each peak to the best voxel about it; return cells, scores and which of the peaks they were."""
+        about = (cells[:, None] + AROUND).reshape(-1, 3)
+        memory.make_room(len(about))
+        scores = np.empty(len(about), np.int64)
+        self._score(S, about, memory.unseen, judge, memory, scores)
+        best = np.arange(len(cells)) * len(AROUND) + scores.reshape(len(cells), -1).argmax(axis=1)
+        best = best[scores[best] > DROPPED]
+        _, ny, nz = S.shape
+        place = (about[best, 0].astype(np.int64) * ny + about[best, 1]) * nz + about[best, 2]
+        _, first = np.unique(place, return_index=True)  # neighbours may meet at the same voxel
+        best = best[np.sort(first)]
+        return about[best], scores[best], best // len(AROUND)
+
+    def _look_about(
+        self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: _Stages, memory: _Memory
+    ) -> I64:
+        """Return the scores of all stages of the judge, with what the cameras saw empty and hidden."""
+        states = np.zeros((len(cells), len(judge.offsets)), np.uint8)
+        in_lattice = cells + memory.first.astype(np.int32)
+        for image in frame.depths:
+            look_about(image.depth, camera_table(image, memory.lattice), in_lattice, judge.offsets, states)
+        seen = np.empty((len(cells), len(judge.offset_start) - 1, 2), np.int32)
+        count_states(states, judge.offset_start, seen)
+        scores = np.empty(len(cells), np.int64)
+        self._score(S, cells, seen, judge, memory, scores, all_stages=True)
+        return scores
 
     def _is_expected(self, cells: I32, expected: Expected, memory: _Memory) -> npt.NDArray[np.bool_]:
         """Whether each of ``cells`` is within reach of any place where a head is expected."""
@@ -382,7 +402,9 @@ class _Memory:
         self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
         self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
         self.marking = [Marking.of(LANES) for _ in range(threads)]
-        tables = [cascade.gate.boxes, *([cascade.stages.boxes] if cascade.stages is not None else [])]
+        tables = [part.boxes for part in (cascade.gate, cascade.stages) if part is not None]
+        if cascade.judge is not None:  # it looks at the neighbours of candidates, too
+            tables += [cascade.judge.boxes + one for one in (-1, 1)]
         self.reach = box_reach(np.concatenate(tables))
         shape = shape_with_margins(lattice.shape, self.reach)
         self.S = np.empty(math.prod(shape), sum_type)
@@ -396,18 +418,9 @@ class _Memory:
         self.candidate_reach = candidate_reach(cascade.gate)
         self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
         self.points = np.empty((MOST_PARTS, 3))
-        self.seen = np.zeros((1, 1, 2), np.int32)
-        self.offsets, self.offset_start = np.empty((0, 3), np.int32), np.zeros(1, np.int32)
-        self.tables: tuple[Any, ...] = ()
-        self.corners = np.empty((0, 8), np.uint64)
-        self.stages: list[tuple[Any, ...]] = [()] * threads
-        self.sees = cascade.source.sees
-        if cascade.stages is not None:
-            boxes, _ = seen_boxes(cascade.stages)
-            self.offsets, self.offset_start = cells_of(boxes)
-            self.corners = np.empty((len(cascade.stages.boxes), 8), np.uint64)
-            stages = StageTables.of(cascade.stages, self.S.dtype)
-            self.tables, self.stages = stages.tables, [stages.memory() for _ in range(threads)]
+        self.unseen = np.zeros((1, 1, 2), np.int32)
+        self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
+        self.judge = _Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 
@@ -442,6 +455,27 @@ class _Memory:
             self.alive = np.empty(2 * candidates, np.int64)
             self.yaws = np.zeros(2 * candidates, np.int32)
             self.peaks = np.empty(2 * candidates, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class _Stages:
+    """Stages as tables, with the working memory of each thread, and the cells that they ask the cameras for."""
+
+    compiled: CompiledStages
+    tables: tuple[npt.NDArray[Any], ...]
+    memory: list[tuple[npt.NDArray[Any], ...]]
+    corners: npt.NDArray[np.uint64]
+    offsets: I32
+    offset_start: I32
+
+    @classmethod
+    def of(cls, compiled: CompiledStages, sum_type: np.dtype[Any], threads: int) -> _Stages:
+        stages = StageTables.of(compiled, sum_type)
+        boxes, _ = seen_boxes(compiled)
+        memory = [stages.memory() for _ in range(threads)]
+        return cls(
+            compiled, stages.tables, memory, np.empty((len(compiled.boxes), 8), np.uint64), *cells_of(boxes)
+        )
 
 
 class _Clock:

@@ -9,14 +9,18 @@ from headvox.data import F64
 from headvox.kernels import kernel
 
 I32 = npt.NDArray[np.int32]
+PEAK_REACH = {1: 1, 2: 1, 4: 2}
+"""How far the neighbours of a voxel are when every voxel, every other, every fourth is a candidate."""
+
 I64 = npt.NDArray[np.int64]
 
 
 @kernel
-def local_maxima(cells, scores, least, index, peaks):  # type: ignore[no-untyped-def]
+def local_maxima(cells, scores, least, reach, index, peaks):  # type: ignore[no-untyped-def]
     """Write the indices of the local maxima to ``peaks``; return how many there are.
 
-    ``index`` is a volume of zeros over all voxels, and is left so.
+    A maximum scores more than all within ``reach`` voxels along each axis. ``index`` is a volume of zeros over all
+    voxels, and is left so.
     """
     nx, ny, nz = index.shape
     for i in range(cells.shape[0]):
@@ -29,9 +33,9 @@ def local_maxima(cells, scores, least, index, peaks):  # type: ignore[no-untyped
             continue
         best = True
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        for a in range(max(x - 1, 0), min(x + 2, nx)):
-            for b in range(max(y - 1, 0), min(y + 2, ny)):
-                for c in range(max(z - 1, 0), min(z + 2, nz)):
+        for a in range(max(x - reach, 0), min(x + reach + 1, nx)):
+            for b in range(max(y - reach, 0), min(y + reach + 1, ny)):
+                for c in range(max(z - reach, 0), min(z + reach + 1, nz)):
                     j = index[a, b, c] - 1
                     # Of equal neighbours the first in the order of the volume is the maximum.
                     if j >= 0 and j != i and (scores[j] > score or (scores[j] == score and j < i)):
@@ -45,14 +49,14 @@ def local_maxima(cells, scores, least, index, peaks):  # type: ignore[no-untyped
     return found
 
 
-def suppress(cells: I32, scores: I64, least: int, shape: tuple[int, ...]) -> I64:
-    """Return the indices of the candidates that score at least ``least`` and more than their 3x3x3 neighbours.
+def suppress(cells: I32, scores: I64, least: int, shape: tuple[int, ...], reach: int = 1) -> I64:
+    """Return the indices of the candidates that score at least ``least`` and more than all within ``reach`` voxels.
 
     ``cells`` (N, 3) are distinct voxels of a volume of ``shape``, in the order of x, y, z. Of equal neighbours the
     first one wins.
     """
     peaks = np.empty(len(cells), np.int64)
-    found = local_maxima(cells, scores, least, np.zeros(shape, np.int32), peaks)
+    found = local_maxima(cells, scores, least, reach, np.zeros(shape, np.int32), peaks)
     return peaks[:found]
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F32, F64, U16, Cloud, DepthImage
+from headvox.data import F32, F64, I64, U16, Cloud, DepthImage
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
 from headvox.kernels import bare_kernel, rule
@@ -94,9 +94,9 @@ class Lattice:
         return self.voxel_m / self.subdivision
 
     @property
-    def odd(self) -> int:
-        """Whether cell 0, 0, 0 is an odd number of voxels from the world's origin, along the axes: 0 or 1."""
-        return sum(round(v / self.voxel_m) for v in self.origin) & 1
+    def odd(self) -> I64:
+        """Whether cell 0, 0, 0 is an odd number of voxels from the world's origin, along each axis: (3,), 0 or 1."""
+        return np.array([round(v / self.voxel_m) & 1 for v in self.origin])
 
     def limits(self) -> F32:
         """Return the region's limits in parts from the origin, as the kernels read them."""

@@ -48,7 +48,9 @@ def _name(kind: str, size_m: float, height: float) -> str:
     return f"{kind}{round(size_m * 100)}_{round(height * 100):+d}"
 
 
-def _rings(kind: str, radius: float, edge: float, heights: Sequence[float], channel: str = "occupied") -> list[Group]:
+def _rings(
+    kind: str, radius: float, edge: float, heights: Sequence[float], channel: str = "occupied"
+) -> list[Group]:
     return [Group(_name(kind, radius, h), ring(radius, float(h), cube(edge)), channel) for h in heights]
 
 
@@ -75,17 +77,22 @@ def occupied_groups() -> list[Group]:
         groups += _rings("ring", radius, edge, heights)
     for radius in (0.05, 0.10, 0.15):
         groups += _rings("fine", radius, 0.05, _heights(-0.10, 0.15, 0.05))
-    for edge, heights in ((0.10, _heights(-0.45, 0.30, 0.05)), (0.25, _heights(-0.45, 0.30, 0.15))):
-        groups += [Group(_name(f"axis{round(edge * 100)}", 0, h).replace("0_", "_"), (Box((0, 0, h), cube(edge)),)) for h in heights]
+    for edge, step in ((0.10, 0.05), (0.25, 0.15)):
+        heights = _heights(-0.45, 0.30, step)
+        groups += [Group(_name("axis", edge, h), (Box((0, 0, h), cube(edge)),)) for h in heights]
     for width in (0.15, 0.25, 0.35, 0.45, 0.65):
-        groups += [Group(_name("slab", width, h), (slab(width, h, 0.10),)) for h in _heights(-0.45, 0.35, 0.10)]
+        groups += [
+            Group(_name("slab", width, h), (slab(width, h, 0.10),)) for h in _heights(-0.45, 0.35, 0.10)
+        ]
     groups += [Group(f"cube{round(e * 100)}", (Box((0, 0, 0), cube(e)),)) for e in (0.05, 0.15, 0.35, 0.45)]
     for out, thick in ((0.10, 0.05), (0.15, 0.05), (0.20, 0.10), (0.30, 0.10)):
         faces = tuple(_face(axis, sign, out, thick) for axis in range(3) for sign in (-1, 1))
         groups.append(Group(f"six{round(out * 100)}", faces))
     for out, edge in ((0.075, 0.15), (0.125, 0.15), (0.20, 0.20)):
         corners = [(out * a, out * b, out * c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
-        groups.append(Group(f"eight{round(out * 1000)}", tuple(Box(corner, cube(edge)) for corner in corners)))
+        groups.append(
+            Group(f"eight{round(out * 1000)}", tuple(Box(corner, cube(edge)) for corner in corners))
+        )
     return groups
 
 
@@ -93,15 +100,17 @@ def seen_groups() -> list[Group]:
     """Return boxes on the axis and rings of small boxes, in the channels "empty" and "hidden"."""
     groups = []
     for channel in CHANNELS[1:]:
-        for height in (-0.30, -0.15, 0.0, 0.15, 0.25, 0.40):
-            groups.append(Group(_name(f"{channel}axis", 0, height).replace("0_", "_"), (Box((0, 0, height), cube(0.15)),), channel))
-        for radius, heights in (
+        heights = (-0.30, -0.15, 0.0, 0.15, 0.25, 0.40)
+        groups += [
+            Group(_name(f"{channel}_axis", 0.15, h), (Box((0, 0, h), cube(0.15)),), channel) for h in heights
+        ]
+        for radius, levels in (
             (0.10, (-0.10, 0.0, 0.10)),
             (0.15, (-0.20, -0.10, 0.05, 0.20)),
             (0.25, (-0.40, -0.20, 0.0, 0.10, 0.25)),
             (0.40, (-0.30, 0.0, 0.15)),
         ):
-            groups += _rings(channel, radius, 0.10, heights, channel)
+            groups += _rings(channel, radius, 0.10, levels, channel)
     return groups
 
 

@@ -54,7 +54,8 @@ SEARCH = (
     Plan("shape", "occupied", 6, 40, 0.15, 0.005),
 )
 JUDGE = (
-    Plan("closer", "occupied", 8, 30, 0.25, 0.002),
+    Plan("nearer", "single", 5, 10, 0.40, 0.001),
+    Plan("closer", "occupied", 8, 40, 0.20, 0.002),
     Plan("detail", "occupied", 24, 220, 0.10, 0.006, costly=False),
     Plan("sight", "seen", 16, 200, 0.08, 0.0, costly=False),
 )
@@ -83,15 +84,19 @@ def boost(samples: Samples, plans: tuple[Plan, ...], seed: int, say: Callable[[s
         have = have + _choose(samples, plan, rows, score, have, seed)
         allowed = pool | POOLS["occupied"] if plan.pool == "seen" else pool
         columns = np.flatnonzero(np.isin(GROUP_OF, have) & allowed)
-        model, score = _fit(samples, columns, rows, score, plan.trees, plan.rate, 1.0 if plan.trees < 40 else 0.5, seed)
+        model, score = _fit(
+            samples, columns, rows, score, plan.trees, plan.rate, 1.0 if plan.trees < 40 else 0.5, seed
+        )
         keep = quantile_of_heads(samples, score, ~samples.aside & rows, plan.lose)
         fitted.append(Fitted(plan, keep, model, [NAMES[c] for c in columns], score))
-        say(f"{plan.name:8s} {describe(samples, score)}")
+        say(f"{plan.name:8s} {describe(samples, score, rows)}")
         rows = rows & (score >= keep)
     return fitted
 
 
-def _choose(samples: Samples, plan: Plan, rows: Mask, score: F64 | None, have: list[str], seed: int) -> list[str]:
+def _choose(
+    samples: Samples, plan: Plan, rows: Mask, score: F64 | None, have: list[str], seed: int
+) -> list[str]:
     """Return the groups that a short boosting over all of the pool gains most from."""
     few = rows & ~samples.aside
     negatives = few & (samples.label == 0)
@@ -125,7 +130,9 @@ def _fit(
     try:
         import lightgbm
     except ImportError:
-        raise HeadvoxError("The search for a cascade needs LightGBM.", "pip install 'headvox[evolve]'") from None
+        raise HeadvoxError(
+            "The search for a cascade needs LightGBM.", "pip install 'headvox[evolve]'"
+        ) from None
     learn = rows & ~samples.aside
     data = lightgbm.Dataset(
         columns_of(samples, learn, columns),
@@ -152,9 +159,9 @@ def quantile_of_heads(samples: Samples, score: F64, rows: Mask, share: float) ->
     return float(np.quantile(best, share)) if len(best) else -1e3
 
 
-def describe(samples: Samples, score: F64) -> str:
-    """Return what the views kept aside say: wrong voxels a view at some recalls."""
-    aside = samples.aside
+def describe(samples: Samples, score: F64, rows: Mask) -> str:
+    """Return what the views kept aside say of the candidates that got so far: wrong ones a view at some recalls."""
+    aside = samples.aside & rows
     views = len(np.unique(samples.view[aside]))
     wrong = score[aside & (samples.label == 0)]
     parts = []
@@ -165,6 +172,8 @@ def describe(samples: Samples, score: F64) -> str:
 
 
 def prune(fitted: list[Fitted], samples: Samples, accepted: Mask, lose: float) -> None:
-    """Raise the threshold of each stage to what the heads among the ``accepted`` rows need, all but a share ``lose``."""
+    """Raise each stage's threshold to what the heads among the ``accepted`` rows need, all but a share ``lose``."""
     for stage in fitted:
-        stage.keep = max(stage.keep, quantile_of_heads(samples, stage.score, accepted & (samples.label == 1), lose))
+        stage.keep = max(
+            stage.keep, quantile_of_heads(samples, stage.score, accepted & (samples.label == 1), lose)
+        )

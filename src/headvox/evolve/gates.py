@@ -15,7 +15,7 @@ import numpy.typing as npt
 from headvox.data import F64
 from headvox.errors import HeadvoxError
 from headvox.evolve.bank import GATE
-from headvox.evolve.samples import GateSums, I64
+from headvox.evolve.samples import I64, GateSums
 from headvox.masks import Condition
 
 LOST_COST = 30.0
@@ -89,7 +89,9 @@ def as_conditions(limits: Limits, sums: GateSums) -> tuple[Condition, ...]:
         group, (low, high) = GATE.groups[best], limits[best]
         volume = sum(
             np.prod(np.diff(box.reshape(3, 2), axis=1)) * weight.weight * 8
-            for box, weight in zip(GATE.boxes[GATE.start[best] : GATE.start[best + 1]], group.boxes, strict=True)
+            for box, weight in zip(
+                GATE.boxes[GATE.start[best] : GATE.start[best + 1]], group.boxes, strict=True
+            )
             if weight.weight > 0
         )
         asks_low = best == 0 or (alive & (others[:, best] < low)).mean() >= NEVER
@@ -107,4 +109,6 @@ def report(limits: Limits, sums: GateSums) -> tuple[float, float]:
     """Return the shares of heads and of other voxels that pass."""
     passing = _passing(sums.sums, limits.astype(np.float64))
     heads = np.unique(sums.bag[sums.bag >= 0])
-    return len(np.unique(sums.bag[passing & (sums.bag >= 0)])) / max(len(heads), 1), float(passing[sums.bag < 0].mean())
+    return len(np.unique(sums.bag[passing & (sums.bag >= 0)])) / max(len(heads), 1), float(
+        passing[sums.bag < 0].mean()
+    )

@@ -22,7 +22,7 @@ from headvox.fuse import Region
 from headvox.gate import pass_gate
 from headvox.integral import integral_volume
 from headvox.masks import CHANNELS, SCORE_UNIT, CompiledGate, CompiledStages
-from headvox.suppress import suppress
+from headvox.suppress import PEAK_REACH, suppress
 from headvox.visibility import count_seen
 from headvox.vote import DROPPED, score_by_stages
 from headvox.voxelize import Lattice, voxelize_depth, voxelize_points
@@ -76,7 +76,9 @@ def is_aside(view: I64) -> npt.NDArray[np.bool_]:
 def join(parts: Iterable[Samples]) -> Samples:
     """Put samples one after the other."""
     listed = list(parts)
-    return Samples(*(np.concatenate([getattr(part, entry.name) for part in listed]) for entry in fields(Samples)))
+    return Samples(
+        *(np.concatenate([getattr(part, entry.name) for part in listed]) for entry in fields(Samples))
+    )
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ class Grid:
         reach = np.arange(-2, 3)
         cells = middle + np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), -1).reshape(-1, 3)
         cells = cells[((cells >= 0) & (cells < np.array(self.S.shape) - 1)).all(axis=1)].astype(np.int32)
-        return cells[np.linalg.norm(self.lattice.centres(cells) - centre, axis=1) <= radius_m]
+        near: I32 = cells[np.linalg.norm(self.lattice.centres(cells) - centre, axis=1) <= radius_m]
+        return near
 
 
 def centre_of(frame: Frame) -> tuple[float, float, float]:
@@ -180,11 +183,13 @@ def search_samples(view: View, gate: CompiledGate, miner: CompiledStages | None)
     rows = np.concatenate([np.flatnonzero(label == 1), chosen])
     seen = np.zeros((len(rows), 0), np.int16)
     view_of = np.full(len(rows), view.number)
-    return Samples(grid.occupied(cells[rows]), seen, label[rows], bag[rows], view_of, np.full(len(rows), grid.sees))
+    return Samples(
+        grid.occupied(cells[rows]), seen, label[rows], bag[rows], view_of, np.full(len(rows), grid.sees)
+    )
 
 
 def judge_samples(
-    view: View, gate: CompiledGate, search: CompiledStages, miner: CompiledStages | None, miner_least: float
+    view: View, gate: CompiledGate, search: CompiledStages, miner: CompiledStages | None, least: float
 ) -> Samples | None:
     """Return voxels about the search's peaks, and about heads; after a first round those that ``miner`` liked best."""
     grid = Grid.of(view.frame)
@@ -194,14 +199,14 @@ def judge_samples(
     peaks = np.empty((0, 3), np.int32)
     if len(cells):
         scores = score_by_stages(grid.S, cells, search)
-        which = suppress(cells, scores, DROPPED + 1, tuple(n - 1 for n in grid.S.shape))
+        which = suppress(cells, scores, DROPPED + 1, tuple(n - 1 for n in grid.S.shape), PEAK_REACH[4])
         peaks = cells[which[np.argsort(-scores[which], kind="stable")]]
     about = (peaks[:, None] + AROUND).reshape(-1, 3)
     inside = ((about >= 0) & (about < np.array(grid.S.shape) - 1)).all(axis=1)
     label, _ = _label(view, grid.lattice.centres(about), JUDGE_NEAR_M)
     false = (label.reshape(-1, len(AROUND)) == 0).all(axis=1) if len(peaks) else np.zeros(0, bool)
     inside = inside.reshape(-1, len(AROUND))
-    chosen = []
+    chosen: list[I64] = []
     for p in np.flatnonzero(false):
         mine = p * len(AROUND) + np.flatnonzero(inside[p])
         if miner is None:
@@ -210,16 +215,22 @@ def judge_samples(
         else:
             score = score_by_stages(grid.S, about[mine], miner, None)
             best = mine[np.argsort(-score, kind="stable")[:2]]
-            if score.max(initial=DROPPED) >= miner_least * SCORE_UNIT and len(chosen) < MOST_PEAKS:
+            if score.max(initial=DROPPED) >= least * SCORE_UNIT and len(chosen) < MOST_PEAKS:
                 chosen.append(best)
     negative = about[np.concatenate(chosen)] if chosen else np.empty((0, 3), np.int32)
-    heads = [grid.near(centre, JUDGE_NEAR_M) for centre in view.heads.centres[to_find(view)]] if miner is None else []
+    heads = (
+        [grid.near(centre, JUDGE_NEAR_M) for centre in view.heads.centres[to_find(view)]]
+        if miner is None
+        else []
+    )
     found = np.concatenate([*heads, negative]).astype(np.int32)
     if len(found) == 0:
         return None
     label, bag = _label(view, grid.lattice.centres(found), JUDGE_NEAR_M)
     view_of = np.full(len(found), view.number)
-    every = Samples(grid.occupied(found), grid.seen(found), label, bag, view_of, np.full(len(found), grid.sees))
+    every = Samples(
+        grid.occupied(found), grid.seen(found), label, bag, view_of, np.full(len(found), grid.sees)
+    )
     return every[every.label >= 0]
 
 
@@ -271,5 +282,3 @@ def of_bags(samples: Samples, score: npt.NDArray[Any], rows: npt.NDArray[np.bool
     best = np.full(len(bags), -np.inf)
     np.maximum.at(best, where, score[mine])
     return bags, best
-
-

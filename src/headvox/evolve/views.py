@@ -12,8 +12,10 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numpy.lib import format as npy
 from scipy.spatial.transform import Rotation
 
@@ -46,8 +48,8 @@ class Heads:
 
     centres: F64
     visible: F64
-    clear: np.ndarray
-    posture: np.ndarray
+    clear: npt.NDArray[np.bool_]
+    posture: npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,9 @@ def make_view(seed: int, number: int) -> View:
     if len(frame.depths) > 1 and rng.uniform() < 0.7:
         frame = replace(frame, depths=tuple(_misplaced(image, rng) for image in frame.depths))
     if rng.uniform() < CUT_SHARE:
-        frame = replace(frame, depths=tuple(_cut(image, float(rng.uniform(1.5, 4.0))) for image in frame.depths))
+        frame = replace(
+            frame, depths=tuple(_cut(image, float(rng.uniform(1.5, 4.0))) for image in frame.depths)
+        )
     return View(number, frame, _heads_of(truth))
 
 
@@ -121,7 +125,7 @@ def _bodies(rng: Rng) -> tuple[Frame, Heads]:
     if rng.random() < 0.5:
         floor = np.stack(np.meshgrid(np.arange(-3, 3, 0.02), np.arange(-3, 3, 0.02)), -1).reshape(-1, 2)
         parts.append(np.column_stack([floor, np.zeros(len(floor))]))
-    points = np.concatenate(parts)
+    points: F64 = np.concatenate(parts).astype(np.float64)
     points = points + rng.normal(0.0, rng.choice([0.0, 0.003]), points.shape)
     count = len(centres)
     heads = Heads(np.array(centres), np.ones(count), np.ones(count, bool), np.array(which))
@@ -157,7 +161,7 @@ def keep_view(folder: Path, seed: int, number: int) -> View:
 
 
 def _write(path: Path, view: View) -> None:
-    arrays = {
+    arrays: dict[str, npt.NDArray[Any]] = {
         "centres": view.heads.centres, "visible": view.heads.visible, "clear": view.heads.clear,
         "posture": view.heads.posture,
     }  # fmt: skip
@@ -183,7 +187,9 @@ def _read(path: Path, number: int) -> View:
             if f"depth_{k}" in arrays.files:
                 width, height, *rest = arrays[f"camera_{k}"].tolist()
                 lens = Intrinsics(int(width), int(height), *rest)
-                depths.append(DepthImage(f"camera_{k}", arrays[f"depth_{k}"], lens, arrays[f"T_world_camera_{k}"]))
+                depths.append(
+                    DepthImage(f"camera_{k}", arrays[f"depth_{k}"], lens, arrays[f"T_world_camera_{k}"])
+                )
             if f"points_{k}" in arrays.files:
                 clouds.append(Cloud(f"cloud_{k}", arrays[f"points_{k}"]))
     return View(number, Frame(0, tuple(clouds), tuple(depths)), heads)

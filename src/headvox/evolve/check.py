@@ -1,0 +1,77 @@
+"""What the detector really does with a cascade, on the views that nothing was fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from headvox.config import DetectorConfig
+from headvox.data import F64, Cloud, Frame
+from headvox.errors import HeadvoxError
+from headvox.evaluate.match import Rules, match
+from headvox.evolve.samples import RANGE_M, to_find
+from headvox.evolve.views import View
+from headvox.frames import unproject
+from headvox.pipeline import Detector
+
+LEAST_SCORE = -8.0
+MISSED = -np.inf
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Scores: ``heads`` (N,) of every head to find, -inf if it was missed; ``false`` (M,) of false heads."""
+
+    heads: F64
+    false: F64
+    frames: int
+
+    def threshold(self, false_a_frame: float) -> float:
+        """Return the lowest score that leaves at most so many false heads a frame, rounded up to a hundredth."""
+        allowed = int(false_a_frame * self.frames)
+        worst = np.sort(self.false)[::-1]
+        least = worst[allowed] if len(worst) > allowed else LEAST_SCORE
+        return float(np.floor(least * 100.0 + 1.0) / 100.0)
+
+    def recall(self, least: float) -> float:
+        """Return the share of the heads that score at least so much."""
+        return float((self.heads >= least).mean()) if len(self.heads) else 0.0
+
+
+def check(cascade: Path, views: Iterable[View], as_clouds: bool = False) -> Outcome:
+    """Run the detector over ``views``; ``as_clouds`` makes points of the depth images, so that nothing is known empty."""
+    detector = Detector(
+        DetectorConfig(cascade=str(cascade), max_range_m=RANGE_M, min_score=LEAST_SCORE, refine="sphere")
+    )
+    heads: list[F64] = []
+    false: list[F64] = []
+    frames = 0
+    for view in views:
+        frame = _points_of(view.frame) if as_clouds else view.frame
+        try:
+            found = detector.detect_frame(frame)
+        except HeadvoxError:  # nothing in range
+            continue
+        frames += 1
+        counted = to_find(view)
+        pairing = match(found.centres, view.heads.centres, counted, Rules(clear_m=0.25))
+        scores = np.full(int(counted.sum()), MISSED)
+        real = np.flatnonzero(counted)
+        scores[np.searchsorted(real, pairing.pairs[:, 1])] = found.scores[pairing.pairs[:, 0]]
+        heads.append(scores)
+        false.append(found.scores[pairing.false])
+    return Outcome(np.concatenate([*heads, np.empty(0)]), np.concatenate([*false, np.empty(0)]), frames)
+
+
+def _points_of(frame: Frame) -> Frame:
+    clouds = [
+        Cloud(
+            image.name,
+            unproject(image.depth, image.intrinsics, image.T_world_camera).astype(np.float32),
+        )
+        for image in frame.depths
+    ]
+    return replace(frame, depths=(), clouds=(*frame.clouds, *clouds))

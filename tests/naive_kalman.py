@@ -14,8 +14,8 @@ def transition(dt):
 
 
 def white_noise(dt, density):
-    a, b = density * dt**3 / 3 * np.eye(3), density * dt**2 / 2 * np.eye(3)
-    return np.block([[a, b], [b, density * dt * np.eye(3)]])
+    q = np.diag(density)
+    return np.block([[q * dt**3 / 3, q * dt**2 / 2], [q * dt**2 / 2, q * dt]])
 
 
 def mixture(weights, means, covs):

@@ -11,6 +11,7 @@ from headvox import kalman
 from headvox.track import TRACK
 
 TIGHT = {"rtol": 1e-9, "atol": 1e-12}
+PLACE_NOISE, TURN_NOISE = np.array([0.8, 0.7, 0.1]), np.array([3.0, 2.0, 4.0])
 ONE = np.zeros(1, np.int64)
 
 
@@ -36,16 +37,16 @@ def test_prediction_equals_matrix_algebra(dt):
     rng = np.random.default_rng(int(dt * 100))
     table = some_tracks(rng)
     before = table.copy()
-    kalman.predict_places(table["x"], table["P"], table["weight"], dt, 1.0, 2.0, 1e-6, 0.8)
-    kalman.predict_turns(table["q"], table["rate"], table["C"], dt, 3.0)
+    kalman.predict_places(table["x"], table["P"], table["weight"], dt, 1.0, 2.0, 1e-6, PLACE_NOISE)
+    kalman.predict_turns(table["q"], table["rate"], table["C"], dt, TURN_NOISE)
     for was, now in zip(before, table, strict=True):
         x, P, weight = naive.predict_place(
-            was["x"], was["P"], was["weight"], dt, 1.0, 2.0, 1e-6, 0.8, kalman.STILL_SPEED_M_S
+            was["x"], was["P"], was["weight"], dt, 1.0, 2.0, 1e-6, PLACE_NOISE, kalman.STILL_SPEED_M_S
         )
         np.testing.assert_allclose(now["x"], x, **TIGHT)
         np.testing.assert_allclose(now["P"], P, **TIGHT)
         np.testing.assert_allclose(now["weight"], weight, **TIGHT)
-        q, C = naive.predict_turn(was["q"], was["rate"], was["C"], dt, 3.0)
+        q, C = naive.predict_turn(was["q"], was["rate"], was["C"], dt, TURN_NOISE)
         np.testing.assert_allclose(now["q"] * np.sign(now["q"] @ q), q, **TIGHT)
         np.testing.assert_allclose(now["C"], C, **TIGHT)
         np.testing.assert_array_equal(now["rate"], was["rate"])
@@ -111,7 +112,7 @@ def test_a_step_worked_out_by_hand():
     table["x"][0, :, 3] = 2.0
     table["weight"] = (kalman.LEAST_WEIGHT, 1.0 - kalman.LEAST_WEIGHT)
     never = 1e12  # no change of model
-    kalman.predict_places(table["x"], table["P"], table["weight"], 0.5, never, never, 0.0, 12.0)
+    kalman.predict_places(table["x"], table["P"], table["weight"], 0.5, never, never, 0.0, np.full(3, 12.0))
     x, P = table["x"][0, kalman.MOVING], table["P"][0, kalman.MOVING]
     np.testing.assert_allclose(x, [1, 0, 0, 2, 0, 0], atol=1e-6)
     np.testing.assert_allclose([P[0, 0], P[0, 3], P[3, 3]], [2.5, 3.5, 10.0])
@@ -127,7 +128,7 @@ def test_a_head_at_rest_is_told_from_one_that_walks():
         table = np.zeros(1, TRACK)
         table["P"], table["weight"] = np.eye(6) * 0.1, 0.5
         for k in range(1, 30):
-            kalman.predict_places(table["x"], table["P"], table["weight"], 0.1, 1.0, 2.0, 1e-6, 1.0)
+            kalman.predict_places(table["x"], table["P"], table["weight"], 0.1, 1.0, 2.0, 1e-6, np.ones(3))
             seen = np.array([[speed * 0.1 * k, 0.0, 1.6]]) + 0.01 * rng.normal(size=(1, 3))
             kalman.correct_places(
                 table["x"], table["P"], table["weight"], ONE, ONE, seen, 1e-4 * np.eye(3)[None]
@@ -141,7 +142,7 @@ def follow_turns(orientations, gate=16.3, sigma=0.1, dt=0.1):
     table["q"] = np.nan
     for k, q in enumerate(orientations):
         if k:
-            kalman.predict_turns(table["q"], table["rate"], table["C"], dt, 4.0)
+            kalman.predict_turns(table["q"], table["rate"], table["C"], dt, np.full(3, 4.0))
         kalman.correct_turns(
             table["q"], table["rate"], table["C"], table["rejected"], ONE, ONE, q[None],
             sigma**2 * np.eye(3)[None], gate,

@@ -20,7 +20,6 @@ from headvox.kernels import kernel, rule
 
 STILL, MOVING = 0, 1
 LEAST_WEIGHT = 1e-6  # a model is never ruled out for good
-FIRST_SPEED_M_S = 0.7  # how fast a head that was never seen before may move
 FIRST_RATE_RAD_S = 1.0
 STILL_SPEED_M_S = 0.01  # what the still model takes for rest
 REJECTED_BEFORE_RESET = 5  # orientations in a row that contradict a track before they are believed
@@ -65,9 +64,9 @@ def _drift(P, dt, density):  # type: ignore[no-untyped-def]
         for j in range(3):
             P[i, 3 + j] += dt * P[3 + i, 3 + j]
     for i in range(3):
-        P[i, i] += density * dt * dt * dt / 3.0
-        P[i, 3 + i] += density * dt * dt / 2.0
-        P[3 + i, 3 + i] += density * dt
+        P[i, i] += density[i] * dt * dt * dt / 3.0
+        P[i, 3 + i] += density[i] * dt * dt / 2.0
+        P[3 + i, 3 + i] += density[i] * dt
         for j in range(3):
             P[3 + j, i] = P[i, 3 + j]
 
@@ -176,7 +175,7 @@ def predict_places(x, P, weight, dt, still_s, moving_s, wander, density):  # typ
     """Mix the models and predict each by ``dt`` seconds, in place.
 
     ``still_s`` and ``moving_s`` are the mean times between a change of model [s], ``wander`` the variance that a still
-    position gains a second [m²/s], ``density`` that of the white acceleration [m²/s³].
+    position gains a second [m²/s], ``density`` (3,) that of the white acceleration along each axis [m²/s³].
     """
     rises, halts = 1.0 - np.exp(-dt / still_s), 1.0 - np.exp(-dt / moving_s)
     for n in range(x.shape[0]):
@@ -198,7 +197,7 @@ def predict_places(x, P, weight, dt, still_s, moving_s, wander, density):  # typ
 
 @kernel
 def predict_turns(q, rate, C, dt, density):  # type: ignore[no-untyped-def]
-    """Predict orientations by ``dt`` seconds, in place; ``density`` [rad²/s³] is that of white turn acceleration."""
+    """Predict orientations by ``dt`` seconds, in place; ``density`` (3,) [rad²/s³] is of white turn acceleration."""
     step, half, angle = np.empty(4), np.empty((3, 6)), np.empty(3)
     for n in range(q.shape[0]):
         if np.isnan(q[n, 3]):

@@ -18,7 +18,6 @@ from headvox.data import F64, I64, Cloud, Expected, Frame, Heads, State, Tracks
 from headvox.errors import HeadvoxError
 from headvox.kalman import (
     FIRST_RATE_RAD_S,
-    FIRST_SPEED_M_S,
     MOVING,
     STILL,
     STILL_SPEED_M_S,
@@ -32,11 +31,17 @@ from headvox.kalman import (
 from headvox.visibility import BEHIND, NO_RETURN, OUT_OF_VIEW, SEEN_EMPTY, SURFACE, see_places
 
 STILL_S, MOVING_S = 1.0, 2.0  # mean times that a head rests and moves
+FIRST_SPEED_M_S = np.array([0.7, 0.7, 0.3])  # standard deviations of the velocity of a head that is new
+UPRIGHT = np.array([1.0, 1.0, 0.4])  # heads move along the floor more than up and down
 WANDER_M2_S = 1e-6  # a head at rest sways by a millimetre in a second
 TURN_GATE = 16.3  # squared Mahalanobis distance: one in a thousand is farther
 FIRST_TURN_RAD = 0.35  # standard deviation of an orientation whose detector states none
+SLACK_M = (
+    0.03  # errors of a detector that stay for a while (hair, view): no noise to a filter, but room for a gate
+)
 NEAR_M, WALK_M_S, FARTHEST_M = 0.35, 1.2, 1.2  # a head is never sought farther than this from its prediction
-BACK_M, BACK_HEIGHT_M, BACK_FARTHEST_M = 0.5, 0.12, 2.0  # nor farther than this from where it was lost
+BACK_M, BACK_M_S, BACK_FARTHEST_M = 0.4, 0.3, 1.0  # nor farther than this from the way that it was lost on
+BACK_HEIGHT_M = 0.1
 LEAST_REACH_M, MOST_REACH_M = 0.12, 0.4  # about an expected place
 MOST_DRAIN = 0.5  # of its life a track loses in one frame, however long: one miss never ends it
 NOT_A_PAIR = 1e6
@@ -49,7 +54,8 @@ TRACK = np.dtype(
         ("hits", np.int64),  # a bit a frame, the last frame lowest
         ("life", np.float64),  # 1 when seen, dies at 0
         ("lost", np.bool_),  # dead, but remembered
-        ("place", np.float64, 3),  # where it was last seen
+        ("place", np.float64, 3),  # where it was last seen, and how fast
+        ("velocity", np.float64, 3),
         ("radius", np.float64),
         ("score", np.float64),
         ("x", np.float64, (2, 6)),
@@ -166,7 +172,7 @@ class Tracker:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         mean, cov = _combined(table)
         squared, log_det = np.empty((2, len(table), len(heads)))
-        compare(mean, cov, heads.centres, R, squared, log_det)
+        compare(mean, cov, heads.centres, R + SLACK_M**2 * np.eye(3), squared, log_det)
         far = np.linalg.norm(mean[:, None, :3] - heads.centres, axis=2)
         unseen_s = (self._now() - table["seen_ns"]) * 1e-9
         possible = squared <= self.config.gate_sigmas**2
@@ -187,7 +193,8 @@ class Tracker:
         table["seen_ns"][tracks] = self._now()
         table["radius"][tracks] = heads.radii[found]
         table["score"][tracks] = heads.scores[found]
-        table["place"][tracks] = heads.centres[found]
+        mean, _ = _combined(table[tracks])
+        table["place"][tracks], table["velocity"][tracks] = mean[:, :3], mean[:, 3:]
         table["hits"][tracks] |= heads.sure[found]
 
     def _age(self, frame: Frame, dt: float, tracks: I64, sure: npt.NDArray[np.bool_]) -> None:
@@ -224,9 +231,15 @@ class Tracker:
         if len(lost):
             unseen_s = (table["born_ns"][n] - table["seen_ns"][lost]) * 1e-9
             away = table["place"][n] - table["place"][lost]
-            reach = np.minimum(BACK_M + WALK_M_S * unseen_s, BACK_FARTHEST_M)
-            unlike = np.hypot(away[:, 0], away[:, 1]) / reach
-            unlike = np.maximum(unlike, np.abs(away[:, 2]) / BACK_HEIGHT_M)
+            path = (
+                table["velocity"][lost] * unseen_s[:, None]
+            )  # if it went on, or stopped anywhere on the way
+            share = np.clip((away * path).sum(axis=1) / np.maximum((path**2).sum(axis=1), 1e-9), 0.0, 1.0)
+            away -= share[:, None] * path
+            reach = np.minimum(BACK_M + BACK_M_S * unseen_s, BACK_FARTHEST_M)
+            unlike = np.linalg.norm(
+                away / np.stack([reach, reach, np.full(len(lost), BACK_HEIGHT_M)], 1), axis=1
+            )
             unlike[unseen_s < 0.0] = np.inf
             best = int(np.argmin(unlike))
             if unlike[best] <= 1.0:
@@ -247,7 +260,7 @@ class Tracker:
         born["radius"], born["score"] = heads.radii[new], heads.scores[new]
         born["x"][:, :, :3] = heads.centres[new, None]
         born["P"][:, :, :3, :3] = R_centre[new, None]
-        born["P"][:, MOVING, 3:, 3:] = FIRST_SPEED_M_S**2 * np.eye(3)
+        born["P"][:, MOVING, 3:, 3:] = np.diag(FIRST_SPEED_M_S**2)
         born["P"][:, STILL, 3:, 3:] = STILL_SPEED_M_S**2 * np.eye(3)
         born["weight"] = 0.5
         born["q"] = heads.quaternions[new]
@@ -270,7 +283,8 @@ class Tracker:
 
     def _move(self, table: Table, dt: float) -> None:
         config = self.config
-        density, turn_density = config.speed_change_m_s**2, np.radians(config.turn_change_deg_s) ** 2
+        density = (config.speed_change_m_s * UPRIGHT) ** 2
+        turn_density = np.full(3, np.radians(config.turn_change_deg_s) ** 2)
         predict_places(table["x"], table["P"], table["weight"], dt, STILL_S, MOVING_S, WANDER_M2_S, density)
         predict_turns(table["q"], table["rate"], table["C"], dt, turn_density)
 

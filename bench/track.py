@@ -1,0 +1,296 @@
+"""How well does the tracker keep people apart, and how smooth is it? On crowds that are simulated up to the detections.
+
+    python bench/track.py [--people 2 4 6] [--hz 10 30] [--drop 0 10 30] [--runs 3] [--seconds 30]
+
+People of different heights walk between places of a room of 4 m by 3 m, cross, stop, stand embraced for a while, and
+leave the camera's view and come back. A coarse depth image of them (spheres on cylinders) tells who hides whom. The
+detector is imitated: each head that is seen is found with the noise of a depth camera (3 mm + 2 mm per m², and an
+error of 1 cm that changes within a second), is missed with the given probability (half of it in bursts), and of two
+heads closer than 18 cm one is found; now and then there is something that is no head. Printed for each kind of crowd:
+
+    MOTA, IDF1    by motmetrics, of everything that has an id, within 30 cm; hidden heads count neither way
+    switches      of identity, a minute
+    alone         MOTA of the bare detections, if every one were given its right id
+    still, lag    rms jitter of people who stand (mm), of tracks and of the bare detections beside; how many frames
+                  the track of a walking head is behind
+    ms            a frame, median
+
+Measure real frames with `headvox run RECORDING --json > found.jsonl; headvox eval RECORDING --found found.jsonl`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from headvox.data import DepthImage, Frame, Heads, Intrinsics, State
+from headvox.evaluate.found import FoundHeads
+from headvox.evaluate.match import Rules
+from headvox.evaluate.metrics import Sample
+from headvox.evaluate.tracking import score_tracks
+from headvox.evaluate.truth import NO_ID, TrueHeads
+from headvox.track import Tracker
+
+CAMERA = Intrinsics(160, 90, 90.0, 90.0, 79.5, 44.5)
+T_WORLD_CAMERA = np.array(
+    [[0.0, -0.25881905, 0.96592583, -2.8], [-1, 0, 0, 0], [0, -0.96592583, -0.25881905, 2.2], [0, 0, 0, 1]]
+)
+HEAD_RADIUS_M, BODY_RADIUS_M = 0.1, 0.18
+FINE_HZ = 60
+RULES = Rules(radius_m=0.3)
+FALSE_A_FRAME = 0.05
+CLOSEST_M = 0.28
+SAME_HEAD_M = 0.18
+
+
+@dataclass(slots=True)
+class Person:
+    """Where a head is, 60 times a second: ``path`` (T, 3) metres, and ``speed`` (T,) m/s."""
+
+    path: np.ndarray
+    speed: np.ndarray
+
+
+def crowd(rng: np.random.Generator, count: int, seconds: float) -> list[Person]:
+    """People who walk from place to place: pairs meet and stand embraced, some leave and come back, one only stands."""
+    tours = []
+    for k in range(count):
+        inside = [rng.uniform((-1.2, -1.1), (1.8, 1.1)) for _ in range(6)]
+        tour = [(rng.uniform(0, 3), place) for place in inside]
+        middle = np.array([rng.uniform(0.0, 1.0), -0.6 + 0.6 * (k // 2)])
+        tour[2] = (
+            3.0,
+            tours[-1][2][1] + np.array([0.0, 0.3]) if k % 2 else middle,
+        )  # 30 cm from head to head
+        if k % 3 == 0:
+            tour[4] = (1.5, np.array([inside[4][0], 3.0]))  # out of view
+        tours.append([(1e9, inside[0])] if count > 2 and k == count - 1 else tour)
+    return stroll(rng, tours, round(seconds * FINE_HZ))
+
+
+def stroll(rng: np.random.Generator, tours: list[list[tuple[float, np.ndarray]]], steps: int) -> list[Person]:
+    """Let each go to the places of their tour in turn, and stay there for the seconds given with it, over and over."""
+    count = len(tours)
+    xy = np.array([tour[0][1] for tour in tours])
+    speed, goal, wait = np.zeros(count), np.zeros(count, int), np.zeros(count)
+    pace, phase = rng.uniform(0.6, 1.2, count), rng.uniform(0, 2 * np.pi, count)
+    heights = rng.uniform(1.45, 1.85, count)
+    people = [Person(np.empty((steps, 3)), np.empty(steps)) for _ in tours]
+    for step in range(steps):
+        before = xy.copy()
+        for k, tour in enumerate(tours):
+            way = tour[goal[k]][1] - xy[k]
+            far = float(np.hypot(*way))
+            if far < 0.05:
+                wait[k] += 1 / FINE_HZ
+                if wait[k] > tour[goal[k]][0]:
+                    goal[k], wait[k] = (goal[k] + 1) % len(tour), 0.0
+            speed[k] += np.clip(min(pace[k], 2.0 * far) - speed[k], -3.6 / FINE_HZ, 1.2 / FINE_HZ)
+            if far > 1e-9:
+                xy[k] += way / far * min(speed[k] / FINE_HZ, far)
+        for k in range(count):
+            for other in range(k):  # nobody walks through anybody
+                way = xy[k] - xy[other]
+                apart = max(float(np.hypot(*way)), 1e-6)
+                if apart < CLOSEST_M:
+                    push = way / apart * min(0.5 * (CLOSEST_M - apart), 1.0 / FINE_HZ)
+                    xy[k] += push
+                    xy[other] -= push
+        moved = np.linalg.norm(xy - before, axis=1) * FINE_HZ
+        phase += 2 * np.pi * moved / 1.35 / FINE_HZ
+        for k, person in enumerate(people):
+            ahead = (xy[k] - before[k]) / max(np.hypot(*(xy[k] - before[k])), 1e-9)
+            sway = 0.025 * min(moved[k] / 1.2, 1.0)
+            person.path[step, :2] = xy[k] + np.array([-ahead[1], ahead[0]]) * sway * np.sin(phase[k])
+            person.path[step, 2] = heights[k] + sway * np.sin(2 * phase[k])
+            person.speed[step] = moved[k]
+    return people
+
+
+def look(places: np.ndarray) -> tuple[DepthImage, np.ndarray]:
+    """Return what the camera sees, and which share (N,) of each head it sees."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
+    rays = rays @ T_WORLD_CAMERA[:3, :3].T
+    eye = T_WORLD_CAMERA[:3, 3]
+    far, owner = np.full(u.shape, 6.0), np.full(u.shape, -1)
+    alone = np.zeros(len(places))
+    for n, place in enumerate(places):
+        head = _ball(rays, eye, place, HEAD_RADIUS_M)
+        alone[n] = np.isfinite(head).sum()
+        body = _pillar(rays, eye, place)
+        for surface, label in ((head, n), (body, len(places))):
+            nearer = surface < far
+            far[nearer], owner[nearer] = surface[nearer], label
+    shares = np.array([(owner == n).sum() for n in range(len(places))]) / np.maximum(alone, 1)
+    shares[alone < 15] = 0.0  # out of view, or only just in it
+    return DepthImage("front", np.round(far * 1000).astype(np.uint16), CAMERA, T_WORLD_CAMERA), shares
+
+
+def _ball(rays: np.ndarray, eye: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    a, b = (rays**2).sum(-1), rays @ (centre - eye)
+    rest = b**2 - a * (((centre - eye) ** 2).sum() - radius**2)
+    hit = (rest > 0) & (b > 0)
+    return np.where(hit, (b - np.sqrt(np.maximum(rest, 0))) / a, np.inf)
+
+
+def _pillar(rays: np.ndarray, eye: np.ndarray, head: np.ndarray) -> np.ndarray:
+    flat, way = rays[..., :2], head[:2] - eye[:2]
+    a, b = (flat**2).sum(-1), flat @ way
+    rest = b**2 - a * ((way**2).sum() - BODY_RADIUS_M**2)
+    t = (b - np.sqrt(np.maximum(rest, 0))) / a
+    height = eye[2] + t * rays[..., 2]
+    return np.where((rest > 0) & (b > 0) & (height < head[2] - 0.22), t, np.inf)
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What came of one run."""
+
+    mota: float
+    idf1: float
+    switches_a_minute: float
+    alone: float
+    still_mm: list[float]
+    bare_mm: list[float]
+    lag_frames: list[float]
+    ms: list[float] = field(default_factory=list)
+
+
+def run(count: int, hz: int, drop: float, seconds: float, seed: int) -> Outcome:
+    """Let a tracker follow a crowd."""
+    rng = np.random.default_rng([seed, count, hz, round(100 * drop)])
+    people = crowd(rng, count, seconds)
+    tracker, samples, bare, ms = Tracker(), [], [], []
+    bias, burst = np.zeros((count, 3)), np.zeros(count, bool)
+    trails: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {n: [] for n in range(count)}
+    for k in range(round(seconds * hz)):
+        step = k * FINE_HZ // hz
+        true = np.array([person.path[step] for person in people])
+        image, shares = look(true)
+        away = np.linalg.norm(true - T_WORLD_CAMERA[:3, 3], axis=1)
+        keep = np.exp(-1.0 / hz)
+        bias = keep * bias + np.sqrt(1 - keep**2) * rng.normal(0, 0.01, (count, 3))
+        # Half of the missing come in bursts of five frames on average.
+        burst = np.where(burst, rng.random(count) > 0.2, rng.random(count) < 0.1 * drop / (1 - 0.5 * drop))
+        missed = burst | (rng.random(count) < 0.5 * drop)
+        seen = np.flatnonzero((shares > 0.5) & ~missed)
+        noise = (0.003 + 0.002 * away**2)[:, None] * rng.normal(size=(count, 3))
+        found = [(n, true[n] + bias[n] + noise[n]) for n in seen]
+        found = [
+            (n, c)
+            for i, (n, c) in enumerate(found)
+            if all(np.linalg.norm(c - d) >= SAME_HEAD_M for _, d in found[:i])
+        ]
+        centres = [c for _, c in found]
+        false = rng.poisson(FALSE_A_FRAME)
+        centres.extend(rng.uniform((-1.2, -1.2, 0.8), (2.0, 1.2, 1.8), (false, 3)))
+        heads = heads_at(centres)
+        frame = Frame(round(k * 1e9 / hz), depths=(image,))
+        begun = time.perf_counter()
+        tracker.expected(frame.stamp_ns)
+        tracks = tracker.update(heads, frame)
+        ms.append(1e3 * (time.perf_counter() - begun))
+        known = tracks.states != State.TENTATIVE
+        truth = TrueHeads(
+            frame.stamp_ns, true, np.full((count, 4), np.nan), np.arange(count), shares < 0.5,
+            np.zeros(count, bool), ({},) * count, {},
+        )  # fmt: skip
+        eye = T_WORLD_CAMERA[None, :3, 3]
+        samples.append(Sample(frame.stamp_ns, as_found(tracks.centres[known], tracks.ids[known]), truth, eye))
+        ids = np.array([n for n, _ in found] + [1000 + k] * false, np.int64)
+        bare.append(Sample(frame.stamp_ns, as_found(heads.centres, ids), truth, eye))
+        for n, measured in found:
+            near = np.linalg.norm(tracks.centres - true[n], axis=1)
+            if len(near) and near.min() < 0.15 and known[near.argmin()]:
+                trails[n].append((step, tracks.centres[near.argmin()] - true[n], measured - true[n]))
+    scores, alone = score_tracks(samples, RULES), score_tracks(bare, RULES)
+    assert scores is not None
+    assert alone is not None
+    outcome = Outcome(
+        scores.mota or 0.0, scores.idf1 or 0.0, 60.0 * (scores.switches or 0) / seconds, alone.mota or 0.0,
+        [], [], [], ms,
+    )  # fmt: skip
+    for n, person in enumerate(people):
+        measure_trail(outcome, person, trails[n], hz)
+    return outcome
+
+
+def measure_trail(
+    outcome: Outcome, person: Person, trail: list[tuple[int, np.ndarray, np.ndarray]], hz: int
+) -> None:
+    """Add the jitter of a standing head, by second, and the lag of a walking one."""
+    if not trail:
+        return
+    steps, errors, measured = (np.array(column) for column in zip(*trail, strict=True))
+    for start in range(0, int(steps[-1]), FINE_HZ):
+        now = (steps >= start) & (steps < start + FINE_HZ)
+        window = person.speed[max(0, start - FINE_HZ) : start + FINE_HZ]
+        if now.sum() >= 0.6 * hz and (window < 1e-3).all():
+            for kept, of in ((outcome.still_mm, errors), (outcome.bare_mm, measured)):
+                kept.append(1e3 * float(np.sqrt(np.var(of[now], axis=0).sum())))
+    ahead = np.gradient(person.path[:, :2], 1 / FINE_HZ, axis=0)[steps]
+    walking = person.speed[steps] > 0.5
+    speed = np.linalg.norm(ahead, axis=1)
+    behind = -(errors[:, :2] * ahead).sum(1)[walking] / speed[walking] ** 2 * hz
+    outcome.lag_frames.extend(behind.tolist())
+
+
+def heads_at(centres: list[np.ndarray]) -> Heads:
+    """Return heads as the detector would."""
+    n = len(centres)
+    return Heads(
+        np.array(centres).reshape(n, 3), np.full((n, 4), np.nan), np.full(n, HEAD_RADIUS_M), np.full(n, 5.0)
+    )
+
+
+def as_found(centres: np.ndarray, ids: np.ndarray) -> FoundHeads:
+    """Return what is to be scored; no id but what is given."""
+    assert (ids != NO_ID).all()
+    n = len(centres)
+    return FoundHeads(centres, np.full((n, 4), np.nan), np.ones(n), ids)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--people", type=int, nargs="+", default=[2, 4, 6])
+    parser.add_argument("--hz", type=int, nargs="+", default=[10, 30])
+    parser.add_argument("--drop", type=float, nargs="+", default=[0, 10, 30], help="percent")
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    print("people  Hz  drop   MOTA   IDF1  switches  alone  still mm  (bare)   lag     ms", flush=True)
+    for people in args.people:
+        for hz in args.hz:
+            for drop in args.drop:
+                runs = [
+                    run(people, hz, drop / 100, args.seconds, args.seed + seed) for seed in range(args.runs)
+                ]
+                mean = [
+                    np.mean([getattr(r, name) for r in runs])
+                    for name in ("mota", "idf1", "switches_a_minute", "alone")
+                ]
+                pooled = [
+                    np.concatenate([getattr(r, name) for r in runs])
+                    for name in ("still_mm", "bare_mm", "lag_frames", "ms")
+                ]
+                rms = [np.sqrt(np.mean(np.square(mm))) if len(mm) else np.nan for mm in pooled[:2]]
+                lag = np.mean(pooled[2]) if len(pooled[2]) else np.nan
+                ms = np.median(pooled[3])
+                print(
+                    f"{people:6d}{hz:4d}{drop:5.0f}%{mean[0]:7.3f}{mean[1]:7.3f}{mean[2]:10.2f}{mean[3]:7.3f}"
+                    f"{rms[0]:10.1f}  ({rms[1]:4.1f}){lag:7.2f}{ms:7.3f}",
+                    flush=True,
+                )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -11,7 +11,13 @@ from headvox.data import BadFrame, Expected
 from headvox.fuse import Region
 from headvox.masks import load_cascade, parse_cascade
 
-SMALL = {"max_range_m": 0.7, "min_height_m": -0.5, "max_height_m": 0.5, "centre": (0.0, 0.0, 0.0)}
+SMALL = {
+    "max_range_m": 0.7,
+    "min_height_m": -0.5,
+    "max_height_m": 0.5,
+    "centre": (0.0, 0.0, 0.0),
+    "refine": "sphere",
+}
 
 
 @pytest.fixture(scope="module")

@@ -408,7 +408,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--min-score", type=number, metavar="S", help="drop heads that score less")
     group.add_argument("--voxel", dest="voxel_m", type=number, metavar="M", help="edge of a voxel")
-    group.add_argument("--refine", choices=("sphere", "none"), help="how a centre is sharpened")
+    group.add_argument("--refine", choices=("pose", "sphere", "none"), help="how a head is sharpened")
     group.add_argument(
         "--score-slack",
         type=number,

@@ -20,6 +20,9 @@ else:
     import tomli as tomllib
 
 
+REFINE = ("pose", "sphere", "none")
+
+
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
     """Everything a :class:`~headvox.pipeline.Detector` can be told."""
@@ -38,8 +41,9 @@ class DetectorConfig:
     """Heads that score less are dropped; by default the cascade's own threshold."""
     voxel_m: float | None = None
     """Edge of a voxel; by default the cascade's own."""
-    refine: str = "sphere"
-    """How a candidate's centre is sharpened: "sphere" (fit to the surface voxels) or "none"."""
+    refine: str = "pose"
+    """How a candidate is sharpened: "pose" (a head fitted to the points: centre and orientation, each with how sure it
+    is), "sphere" (a sphere fitted to the surface voxels: centre only) or "none"."""
     score_slack: float = 1.0
     """Where a tracker expects a head, it may score this much less than others."""
     threads: int = 1
@@ -58,7 +62,7 @@ class DetectorConfig:
         _require(
             low < high <= low + 20.0, "max_height_m", f"above min_height_m ({low:g}), by 20 m at most", high
         )
-        _require(self.refine in ("sphere", "none"), "refine", '"sphere" or "none"', self.refine)
+        _require(self.refine in REFINE, "refine", '"pose", "sphere" or "none"', self.refine)
         _require(1 <= self.threads <= 64, "threads", "1 to 64", self.threads)
         if self.voxel_m is not None:
             _require(0.005 <= self.voxel_m <= 0.2, "voxel_m", "0.005 to 0.2 m", self.voxel_m)

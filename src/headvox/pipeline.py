@@ -21,6 +21,7 @@ from headvox.gate import candidate_reach, gate_columns, gate_tables
 from headvox.integral import box_reach, integrate, set_corners, shape_with_margins
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, CompiledStages, compile_cascade, load_cascade
+from headvox.pose import Scratch, fit_poses
 from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
 from headvox.simd import LANES
 from headvox.suppress import PEAK_REACH, local_maxima, suppress_overlaps
@@ -45,6 +46,8 @@ SAME_HEAD_M = 0.18
 MOST_PEAKS = 256
 AROUND = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
 """A voxel and its neighbours."""
+MOST_POSES = 32
+"""Heads of a frame that get a pose, best score first."""
 
 
 class Detector:
@@ -115,7 +118,7 @@ class Detector:
         clock.done("suppress")
         cells, scores, peaks, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
         clock.done("judge")
-        heads = self._refine(frame, cells, scores, peaks, least, memory)
+        heads = self._refine(frame, cells, scores, peaks, least, memory, expected)
         clock.done("refine")
         return heads
 
@@ -321,7 +324,14 @@ class Detector:
         return within
 
     def _refine(
-        self, frame: Frame, cells: I32, scores: I64, peaks: I64, least: int, memory: _Memory
+        self,
+        frame: Frame,
+        cells: I32,
+        scores: I64,
+        peaks: I64,
+        least: int,
+        memory: _Memory,
+        expected: Expected | None,
     ) -> Heads:
         count = len(cells)
         if count == 0:
@@ -329,7 +339,7 @@ class Detector:
         cells = cells + memory.first.astype(np.int32)
         centres = memory.lattice.centres(cells)
         radii = np.full(count, 0.1)
-        if self.config.refine == "sphere":
+        if self.config.refine != "none":
             spheres = np.empty((count, 6))
             lattice = memory.lattice
             counting = self.cascade.source.counting
@@ -345,12 +355,37 @@ class Detector:
         if self.cascade.votes is not None:
             half = 0.5 * self.cascade.votes.yaws_rad[memory.yaws[peaks]]
             quaternions = np.stack([np.zeros(count), np.zeros(count), np.sin(half), np.cos(half)], axis=1)
-        return Heads(
+        heads = Heads(
             centres[kept],
             quaternions[kept],
             radii[kept],
             scores[kept] / SCORE_UNIT,
             sure=scores[kept] >= least,
+        )
+        return self._fit_poses(frame, heads, memory, expected) if self.config.refine == "pose" else heads
+
+    def _fit_poses(self, frame: Frame, heads: Heads, memory: _Memory, expected: Expected | None) -> Heads:
+        """Align the head template to the points about each of the best heads; the others stay as they are."""
+        best = slice(0, MOST_POSES)
+        poses = fit_poses(frame, heads.centres[best], memory.scratch, self._threads, expected)
+        fitted = np.isfinite(poses.radii)
+        centres, radii = heads.centres.copy(), heads.radii.copy()
+        quaternions = np.full((len(heads), 4), np.nan)
+        centre_covariances = np.full((len(heads), 3, 3), np.nan)
+        rotation_covariances = centre_covariances.copy()
+        centres[best][fitted], radii[best][fitted] = poses.centres[fitted], poses.radii[fitted]
+        quaternions[best] = poses.quaternions
+        centre_covariances[best] = poses.centre_covariances
+        rotation_covariances[best] = poses.rotation_covariances
+        kept = suppress_overlaps(centres, heads.scores, SAME_HEAD_M)  # two starts may have found one head
+        return Heads(
+            centres[kept],
+            quaternions[kept],
+            radii[kept],
+            heads.scores[kept],
+            centre_covariances[kept],
+            rotation_covariances[kept],
+            heads.sure[kept],
         )
 
     # -------------------------------------------------------------------------------------------- working memory
@@ -421,6 +456,7 @@ class _Memory:
         self.unseen = np.zeros((1, 1, 2), np.int32)
         self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
         self.judge = _Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
+        self.scratch = [Scratch() for _ in range(threads if detector.config.refine == "pose" else 0)]
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 

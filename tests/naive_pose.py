@@ -1,0 +1,138 @@
+"""Slow, obvious twins of the loops of the pose fit: one NumPy line a formula."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import expm
+
+from headvox import align, nearby
+from headvox.data import Frame
+
+
+def gather(frame: Frame, centre, reach=nearby.REACH_M):
+    """All points and passing rays of depth images whose windows need no stride, and of small clouds."""
+    samples, rays = [], []
+    for image in frame.depths:
+        c, T = image.intrinsics, image.T_world_camera
+        for v, u in np.argwhere(image.depth > 0):
+            z = image.depth[v, u] * c.depth_scale
+            ray = T[:3, :3] @ [(u - c.cx) / c.fx, (v - c.cy) / c.fy, 1.0]
+            sigmas = nearby.DEPTH_SIGMA_M + nearby.DEPTH_SIGMA_PER_M * z**2, nearby.PIXEL_SIGMA * z / c.fx
+            _enter(samples, rays, T[:3, 3] - centre, ray * z, sigmas, reach)
+    for cloud in frame.clouds:
+        T = np.eye(4) if cloud.T_world_sensor is None else cloud.T_world_sensor
+        for point in cloud.points[np.isfinite(cloud.points).all(axis=1)]:
+            away = T[:3, :3] @ point.astype(np.float64)
+            far = np.linalg.norm(away)
+            sigmas = nearby.DEPTH_SIGMA_M + nearby.DEPTH_SIGMA_PER_M * far**2
+            sigmas = sigmas, nearby.PIXEL_SIGMA * far / nearby.CLOUD_FOCAL_PX
+            if cloud.T_world_sensor is not None:
+                _enter(samples, rays, T[:3, 3] - centre, away, sigmas, reach)
+            elif np.linalg.norm(away - centre) < reach:
+                samples.append([*(away - centre), 0, 0, 0, 0, nearby.UNKNOWN_SIGMA_M])
+    return np.array(samples).reshape(-1, nearby.SAMPLE), np.array(rays).reshape(-1, nearby.RAY)
+
+
+def _enter(samples, rays, start, away, sigmas, reach):
+    length = np.linalg.norm(away)
+    ray = away / length
+    if np.linalg.norm(start + away) < reach:
+        samples.append([*(start + away), *ray, *sigmas])
+        return
+    along = -start @ ray
+    if 0 < along < length and np.linalg.norm(start + along * ray) < reach:
+        rays.append([*(start + along * ray), *ray])
+
+
+def even(count, most):
+    used = min(count, most)
+    return [(2 * s + 1) * count // (2 * used) for s in range(used)]
+
+
+def residuals(state, points, modes, template):
+    """Distance, gradient, place in the head, sigma and modes of the points on the grid, and which those are."""
+    R, scale = state[3:12].reshape(3, 3), np.exp(state[12])
+    q = (points - state[:3]) @ R / scale
+    cell = np.floor((q - template.low) / template.voxel_m).astype(int)
+    inside = ((cell >= 0) & (cell < template.rows.shape[:3])).all(axis=1)
+    row = template.rows[tuple(cell[inside].T)].astype(np.float64)
+    q = q[inside]
+    middle = template.low + (cell[inside] + 0.5) * template.voxel_m
+    shape = row[:, 5 : 5 + modes]
+    value = row[:, 0] + ((q - middle) * row[:, 1:4]).sum(axis=1) + shape @ state[13 : 13 + modes]
+    return value, row[:, 1:4], q, row[:, 4], shape, inside
+
+
+def linearise(samples, rays, most, modes, k, upright, template, state):
+    """Cost, A and b of the normal equations, and what is told."""
+    R, scale = state[3:12].reshape(3, 3), np.exp(state[12])
+    size = 7 + modes
+    A, b, cost = np.zeros((size, size)), np.zeros(size), 0.0
+    told = np.zeros(3)
+    chosen = samples[even(len(samples), most[0])]
+    passing = rays[even(len(rays), most[1])]
+    near = passing[:, :3] - state[:3]
+    near = near - (near * passing[:, 3:]).sum(axis=1, keepdims=True) * passing[:, 3:] + state[:3]
+    for points, kind in ((chosen[:, :3], "point"), (near, "ray")):
+        value, g, q, sigma, shape, inside = residuals(state, points, modes, template)
+        e, variance = scale * value, (scale * sigma) ** 2
+        J = np.hstack([-g, scale * np.cross(g, q), scale * (value - (g * q).sum(1))[:, None], scale * shape])
+        if kind == "point":
+            s = chosen[inside]
+            variance = variance + (s[:, 6] * (g * (s[:, 3:6] @ R)).sum(axis=1)) ** 2 + s[:, 7] ** 2
+            weight = np.ones(len(e))
+            cost += k * k * np.sum(~inside)
+        else:
+            weight = np.where(e < 0, align.RAY_WEIGHT, 0.0)
+            told[align.CROSSED] = np.sum(e < 0)
+        damp = 1 / (1 + e**2 / variance / k**2)
+        cost += np.sum(weight * e**2 / variance * damp)
+        if kind == "point":
+            cost += np.sum(align.SIGMA_WEIGHT * damp * np.log(variance / align.SIGMA_UNIT_M**2))
+            told[align.COST], told[align.ON_SURFACE] = cost / 2, np.sum(e**2 / variance < k**2)
+        w = np.where(damp < align.LEAST_DAMPING, 0.0, weight * damp**2 / variance)
+        A += (J * w[:, None]).T @ J
+        b += (J * w[:, None]).T @ e
+    priors = [
+        (np.vstack([R.T, np.zeros((size - 3, 3))]).T, state[:3], 1 / align.CENTRE_SIGMA_M**2),
+        (np.eye(size)[6:7], state[12:13], 1 / align.SCALE_SIGMA**2),
+        (np.eye(size)[7:], state[13 : 13 + modes], 1.0),
+    ]
+    if upright:
+        up = R[2]
+        turned = np.cross(np.eye(3), up)  # row i: how up[i] changes with a turn w is (up x w)[i]
+        rows = np.zeros((2, size))
+        rows[:, 3:6] = turned[:2]
+        priors += [(rows[:1], up[:1], align.PITCH_SIGMA**-2), (rows[1:], up[1:2], align.ROLL_SIGMA**-2)]
+    for J, e, w in priors:
+        A += w * J.T @ J
+        b += w * J.T @ e
+        cost += w * e @ e
+    return cost / 2, A, b, told
+
+
+def move(state, step):
+    """The state after a step, cut to a bearable length."""
+    far, turn = np.linalg.norm(step[:3]), np.linalg.norm(step[3:6])
+    step = step / max(1.0, far / align.LONGEST_STEP_M, turn / align.LARGEST_TURN_RAD)
+    R = state[3:12].reshape(3, 3)
+    x, y, z = step[3:6]
+    new = state.copy()
+    new[:3] += R @ step[:3]
+    new[3:12] = (R @ expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))).reshape(9)
+    new[12 : 6 + len(step)] += step[6:]
+    new[12] = np.clip(new[12], -align.LARGEST_LOG_SCALE, align.LARGEST_LOG_SCALE)
+    return new
+
+
+def align_one(samples, rays, turn, upright, template):
+    """What a single start comes to: state, told, covariance of shift and turn."""
+    modes = align.MODES
+    state = np.zeros(align.STATE)
+    state[3:12] = turn
+    most = (align.FINE_SAMPLES, align.FINE_RAYS)
+    for k in np.linspace(align.FINE_K, align.LAST_K, align.FINE_STEPS):
+        _, A, b, _ = linearise(samples, rays, most, modes, k, upright, template, state)
+        state = move(state, -np.linalg.solve(A, b))
+    cost, A, _, told = linearise(samples, rays, most, modes, align.LAST_K, upright, template, state)
+    return state, [*told, cost + 0.5 * np.linalg.slogdet(A)[1]], np.linalg.inv(A)[:6, :6]

@@ -1,0 +1,255 @@
+import naive_pose
+import numpy as np
+import pytest
+import scenes
+from scipy.spatial.transform import Rotation
+
+from headvox import Cloud, DepthImage, Frame, Intrinsics, align, nearby
+from headvox.data import Expected
+from headvox.kernels import Threads
+from headvox.pose import Scratch, all_turns, expected_turns, fit_poses, upright_turns
+from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
+from headvox.synth.portraits import portrait
+from headvox.synth.spread import spread_points
+from headvox.template import load_template
+
+TEMPLATE = load_template()
+
+
+def camera(distance=1.0, width=48, focal=45.0):
+    """A camera that looks along x at the origin."""
+    return (
+        Intrinsics(width, width, focal, focal, width / 2 - 0.5, width / 2 - 0.5),
+        scenes.looking_along_x(-distance, 0, 0),
+    )
+
+
+def bumpy_image(rng, distance=1.0):
+    """A wall with a bulge of noise in its middle, some pixels lost."""
+    lens, T = camera(distance)
+    depth = np.full((48, 48), 2600, np.uint16)
+    depth[20:27, 20:28] = rng.normal(1000 * distance, 60, (7, 8)).astype(np.uint16)
+    depth[rng.random((48, 48)) < 0.1] = 0
+    return DepthImage("bumpy", depth, lens, T)
+
+
+def gathered(frame, centre):
+    samples, rays = (
+        np.zeros((nearby.MOST_SAMPLES, nearby.SAMPLE)),
+        np.zeros((nearby.MOST_SAMPLES, nearby.RAY)),
+    )
+    n, m = nearby.gather(frame, np.asarray(centre, dtype=np.float64), samples, rays)
+    return samples[:n], rays[:m]
+
+
+def fitted(frame, centres, expected=None, threads=1):
+    pool = Threads(threads)
+    try:
+        scratch = [Scratch() for _ in range(threads)]
+        return fit_poses(frame, np.asarray(centres, dtype=np.float64).reshape(-1, 3), scratch, pool, expected)
+    finally:
+        pool.close()
+
+
+@pytest.fixture(scope="module")
+def views():
+    """People nobody has learnt from, each with a start 4 cm off."""
+    rng = np.random.default_rng(3)
+    made = []
+    for k, (distance, bearing) in enumerate([(1.0, 0.2), (1.2, 1.5), (1.4, -0.6)]):
+        view = portrait((0x7E57, k), distance, bearing, posture="standing")
+        off = rng.normal(size=3)
+        made.append((view, view.head.centre + 0.04 * off / np.linalg.norm(off)))
+    return made
+
+
+# -------------------------------------------------------------------------------------------------------- the twins
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gathering_equals_the_naive_twin(seed):
+    rng = np.random.default_rng(seed)
+    cloud = rng.normal(0, 0.3, (300, 3)).astype(np.float32)
+    cloud[::7] = np.nan
+    T = scenes.pose(rng)
+    frame = Frame(
+        0, clouds=(Cloud("known", cloud, T), Cloud("unknown", cloud)), depths=(bumpy_image(rng, 0.9),)
+    )
+    centre = rng.normal(0, 0.05, 3)
+    for got, wanted in zip(gathered(frame, centre), naive_pose.gather(frame, centre), strict=True):
+        assert len(wanted) > 20
+        np.testing.assert_allclose(got, wanted, atol=1e-12)
+
+
+def random_state(rng):
+    state = np.zeros(align.STATE)
+    state[:3] = rng.normal(0, 0.02, 3)
+    state[3:12] = Rotation.from_rotvec(rng.normal(0, 0.7, 3)).as_matrix().reshape(9)
+    state[12] = rng.normal(0, 0.05)
+    state[13:] = rng.normal(0, 0.7, align.MODES)
+    return state
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("modes", [align.COARSE_MODES, align.MODES])
+def test_normal_equations_equal_the_naive_twin(seed, modes):
+    rng = np.random.default_rng(seed)
+    samples, rays = gathered(Frame(0, depths=(bumpy_image(rng),)), np.zeros(3))
+    state, upright = random_state(rng), seed % 2 == 0
+    A, J, told = np.empty((17, 18)), np.empty(18), np.zeros(align.TOLD)
+    most = np.array([150, 90])
+    cost = align.linearise(
+        samples, len(samples), rays, len(rays), most, modes, 4.0, upright,
+        TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m, state, A, J, told,
+    )  # fmt: skip
+    wanted = naive_pose.linearise(samples, rays, most, modes, 4.0, upright, TEMPLATE, state)
+    size = 7 + modes
+    np.testing.assert_allclose(cost, wanted[0], rtol=1e-9)
+    np.testing.assert_allclose(np.triu(A[:size, :size]), np.triu(wanted[1]), rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(A[:size, align.RESIDUAL], wanted[2], rtol=1e-6, atol=1e-4)
+    np.testing.assert_allclose(told[:3], wanted[3], rtol=1e-9)
+    assert told[align.CROSSED] > 0
+
+
+def test_one_start_equals_the_naive_twin(views):
+    for view, start in views[:2]:
+        samples, rays = gathered(view.frame, start)
+        turn = Rotation.from_quat(view.head.quaternion).as_matrix().reshape(1, 9)
+        scratch = Scratch()
+        count = align.align(
+            samples, len(samples), rays, len(rays), turn, True, TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m,
+            scratch.coarse, scratch.fine, scratch.told, scratch.covariances,
+        )  # fmt: skip
+        state, told, covariance = naive_pose.align_one(samples, rays, turn[0], True, TEMPLATE)
+        assert count == 1
+        np.testing.assert_allclose(scratch.fine[0], state, atol=1e-6)
+        np.testing.assert_allclose(scratch.told[0], told, rtol=1e-6)
+        np.testing.assert_allclose(scratch.covariances[0], covariance, rtol=1e-4, atol=1e-12)
+
+
+# -------------------------------------------------------------------------------------------------------- the truth
+
+
+def test_heads_are_where_it_says_within_what_it_states(views):
+    for view, start in views:
+        poses = fitted(view.frame, start)
+        error = poses.centres[0] - view.head.centre
+        assert np.linalg.norm(error) < 0.02
+        assert error @ np.linalg.solve(poses.centre_covariances[0], error) < 3 * 5.2**2
+        turn = Rotation.from_quat(poses.quaternions[0]).inv() * Rotation.from_quat(view.head.quaternion)
+        d = turn.as_rotvec()
+        assert np.degrees(np.linalg.norm(d)) < 15
+        assert d @ np.linalg.solve(poses.rotation_covariances[0], d) < 3 * 5.2**2
+        assert 0.07 < poses.radii[0] < 0.12
+        assert poses.coverages[0] > 0.9
+
+
+def test_a_shell_is_found_however_it_is_turned():
+    shell = make_shell(sample_identities(3, 11)[1], False)
+    points = spread_points(shell.vertices, shell.faces, 1500, np.random.default_rng(0)) @ HEADVOX_TO_PAPER
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        R, centre = Rotation.random(random_state=seed), rng.uniform(-0.5, 0.5, 3)
+        cloud = (R.apply(points) + centre).astype(np.float32)
+        poses = fitted(Frame(0, clouds=(Cloud("shell", cloud),)), centre + np.array((0.03, -0.02, 0.02)))
+        assert np.linalg.norm(poses.centres[0] - centre) < 0.01
+        turn = R.inv() * Rotation.from_quat(poses.quaternions[0])
+        assert np.degrees(turn.magnitude()) < 8
+
+
+def test_from_an_expected_orientation(views):
+    view, start = views[0]
+    turned = Rotation.from_quat(view.head.quaternion) * Rotation.from_euler("z", 12, degrees=True)
+    expected = Expected(view.head.centre[None], turned.as_quat()[None], np.array([0.2]))
+    poses = fitted(view.frame, start, expected)
+    error = Rotation.from_quat(poses.quaternions[0]).inv() * Rotation.from_quat(view.head.quaternion)
+    assert np.linalg.norm(poses.centres[0] - view.head.centre) < 0.02
+    assert np.degrees(error.magnitude()) < 15
+
+
+def test_what_is_expected_holds_within_reach_only():
+    expected = Expected(
+        np.array([[0, 0, 0], [1, 0, 0], [0.1, 0, 0]], dtype=np.float64),
+        np.array([[0, 0, 0, 1], [0, 0, 1, 0], [np.nan] * 4]),
+        np.array([0.2, 0.1, 0.5]),
+    )
+    turns = expected_turns(np.array([[0.08, 0, 0], [1.05, 0, 0], [0.7, 0, 0]]), expected)
+    np.testing.assert_allclose(turns[0], np.eye(3).reshape(9))
+    np.testing.assert_allclose(turns[1], np.diag([-1, -1, 1]).reshape(9), atol=1e-12)
+    assert np.isnan(turns[2]).all()
+
+
+def test_the_starts_are_rotations():
+    for turns, count in ((upright_turns(), 10), (all_turns(), 60)):
+        R = turns.reshape(-1, 3, 3)
+        assert len(R) == count
+        np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (count, 1, 1)), atol=1e-12)
+        np.testing.assert_allclose(np.linalg.det(R), 1)
+
+
+# ------------------------------------------------------------------------------------------------------ hard inputs
+
+
+def cloud_of(points):
+    return Frame(0, clouds=(Cloud("c", np.ascontiguousarray(points, dtype=np.float32)),))
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.full((50, 3), np.nan),
+        np.full((50, 3), 9.0),
+        np.zeros((1, 3)),
+        np.array([[np.inf, 0, 0], [-np.inf, 1, 1], [0, 0, 0]]),
+    ],
+    ids=["all NaN", "far away", "one", "infinite"],
+)
+def test_too_little_leaves_the_candidate_as_it_is(points):
+    poses = fitted(cloud_of(points), [[0.0, 0.1, 0.0]])
+    assert poses.centres.tolist() == [[0.0, 0.1, 0.0]]
+    for unknown in (poses.quaternions, poses.radii, poses.centre_covariances, poses.misfits):
+        assert np.isnan(unknown).all()
+
+
+@pytest.mark.parametrize("kind", ["plane", "line", "same point"])
+def test_points_that_are_no_head_give_finite_centres(kind):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.3, 0.3, (2000, 3))
+    points[:, {"plane": [2], "line": [1, 2], "same point": [0, 1, 2]}[kind]] = 0.01
+    poses = fitted(cloud_of(points), [[0.0, 0.0, 0.0]])
+    assert np.isfinite(poses.centres).all()
+    assert np.linalg.norm(poses.centres) < 0.3
+    assert np.linalg.eigvalsh(poses.centre_covariances[0]).min() > 0
+
+
+def test_no_candidate():
+    assert fitted(cloud_of(np.zeros((5, 3))), np.empty((0, 3))).centres.shape == (0, 3)
+
+
+def test_a_huge_image_and_a_dense_cloud_do_not_overrun_the_memory():
+    lens, T = camera(0.6, 3000, 3000.0)
+    image = DepthImage("huge", np.full((3000, 3000), 600, np.uint16), lens, T)
+    dense = np.random.default_rng(0).normal(0, 0.1, (200_000, 3)).astype(np.float32)
+    sensors = (Cloud("a", dense), Cloud("b", dense, T))
+    samples, _ = gathered(Frame(0, clouds=sensors, depths=(image,)), np.zeros(3))
+    assert len(samples) <= nearby.MOST_SAMPLES
+    kinds = [np.sum(samples[:, 7] == nearby.UNKNOWN_SIGMA_M), np.sum(samples[:, 7] < 0.0003)]
+    assert min(kinds) > 500  # every sensor has its share
+    assert np.isfinite(fitted(Frame(0, depths=(image,)), [[0.0, 0.0, 0.0]]).centres).all()
+
+
+def test_more_sensors_than_room():
+    image = bumpy_image(np.random.default_rng(0))
+    samples, rays = np.zeros((50, nearby.SAMPLE)), np.zeros((50, nearby.RAY))
+    n, m = nearby.gather(Frame(0, depths=(image,) * 120), np.zeros(3), samples, rays)
+    assert 0 < n <= 50
+    assert m <= 50
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_do_not_change_a_byte(views, threads):
+    view, start = views[0]
+    starts = start + np.random.default_rng(0).normal(0, 0.02, (7, 3))
+    one, many = fitted(view.frame, starts), fitted(view.frame, starts, threads=threads)
+    for name in ("centres", "quaternions", "radii", "centre_covariances", "rotation_covariances", "misfits"):
+        assert getattr(one, name).tobytes() == getattr(many, name).tobytes()

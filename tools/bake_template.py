@@ -1,0 +1,185 @@
+"""Bake the head that the pose fit aligns into ``src/headvox/assets/template.npz``.
+
+The heads are those of ``headvox.synth``: haired and dressed people in every posture, with their necks and shoulders.
+Each is brought into its own head frame and to the size of the mean head; depth cameras all around it say what can be
+seen of its surface and what of the space about it is free, which gives a signed distance on a grid of 10 mm voxels:
+above zero where it is free. Every person counts twice, once mirrored. What is kept:
+
+- the mean signed distance;
+- its principal modes near the surface, hair and clothes weighing less than a face; the rest by regression;
+- the standard deviation of what the modes leave unexplained: small on a face, large on hair and shoulders.
+
+Identities are drawn from seeds of their own (``TRAINING``), which nothing that measures accuracy uses.
+
+    python tools/bake_template.py --people 400 --workers 2
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+
+from headvox.data import Intrinsics
+from headvox.frames import inverse, transform
+from headvox.kernels import kernel
+from headvox.synth.people import PosedBody, pose_person, sample_person, sample_pose
+from headvox.synth.people import _rest as rest
+from headvox.synth.processes import in_processes
+from headvox.synth.rays import Mesh, look
+
+TRAINING = 0x7E3A1
+POSTURES = ("standing", "walking", "sitting", "bending", "crouching", "lying")
+POSTURE_SHARES = (0.35, 0.25, 0.25, 0.05, 0.05, 0.05)
+VOXEL_M = 0.01
+LOW = np.array((-0.26, -0.28, -0.30))  # of the grid, head frame, metres
+SHAPE = (52, 56, 51)
+DIRECTIONS = 60
+LOWEST_DIRECTION = -0.35  # sine of the elevation: from below one would look through the bodies
+AWAY_M = 1.6
+LENS = Intrinsics(200, 200, 375.0, 375.0, 99.5, 99.5)
+FARTHEST_M = 0.08  # distances are cut off here
+BAND_M = 0.025  # how far from the surface a mode matters
+MEAN_UNIT_M, SIGMA_UNIT_M = 5e-5, 2e-4
+FLOOR_M = 0.0025  # of a sigma: what the template's voxels cost
+
+
+def voxel_centres() -> np.ndarray:
+    """Return the centres (N, 3) of the grid's voxels in the head frame, z fastest."""
+    axes = [low + VOXEL_M * (np.arange(n) + 0.5) for low, n in zip(LOW, SHAPE, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def camera_poses() -> np.ndarray:
+    """Return T_head_camera (C, 4, 4) of cameras all around, each looking at the head's centre."""
+    k = np.arange(2 * DIRECTIONS) + 0.5
+    height = 1.0 - k / DIRECTIONS
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * k
+    flat = np.sqrt(1.0 - height**2)
+    places = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
+    poses = []
+    for place in places[height > LOWEST_DIRECTION]:
+        right = np.cross(-place, (0.0, 0.0, 1.0))
+        right /= max(np.linalg.norm(right), 1e-9)
+        T = np.eye(4)
+        T[:3, :3] = np.column_stack([right, np.cross(-place, right), -place])
+        T[:3, 3] = AWAY_M * place
+        poses.append(T)
+    return np.array(poses)
+
+
+def signed_distance(body: PosedBody, scale: float) -> np.ndarray:
+    """Return the signed distance (N,) of the voxels to the visible surface, of the head scaled to the mean size."""
+    vertices = transform(inverse(body.T_world_head), body.vertices) / scale
+    ones = np.ones(len(body.faces), np.float32)
+    mesh = Mesh(vertices, body.faces, ones, np.zeros(len(ones), np.int32))
+    voxels = voxel_centres()
+    seen = np.zeros(len(voxels), np.int64)
+    surface = []
+    for T_head_camera in camera_poses():
+        distance = look(mesh, LENS, T_head_camera).distance_m
+        v, u = np.nonzero(distance < AWAY_M + 0.5)
+        z = distance[v, u].astype(np.float64)
+        rays = np.column_stack([(u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones(len(u))])
+        surface.append(transform(T_head_camera, rays * z[:, None]))
+        count_sights(voxels, inverse(T_head_camera), LENS.fx, LENS.cx, distance, seen)
+    points = np.concatenate(surface)
+    points = points[(np.abs(points) < 0.4).all(1)]
+    key = np.floor(points / 0.003).astype(np.int64) @ (1, 1000, 1000_000)
+    tree = cKDTree(points[np.unique(key, return_index=True)[1]])
+    distance = np.minimum(tree.query(voxels, distance_upper_bound=FARTHEST_M)[0], FARTHEST_M)
+    return np.where(seen > 1, distance, -distance).astype(np.float16)
+
+
+@kernel
+def count_sights(voxels, T_camera_head, f, c, distance, seen):
+    """Add one to ``seen`` (N,) for each of ``voxels`` (N, 3) that lies before the surface in a square image."""
+    T = T_camera_head
+    for i in range(len(voxels)):
+        x, y, z = voxels[i]
+        depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        column = int(np.rint(f * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / depth + c))
+        row = int(np.rint(f * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / depth + c))
+        if 0 <= column < distance.shape[1] and 0 <= row < distance.shape[0] and depth < distance[row, column]:
+            seen[i] += 1
+
+
+def head_of(number: int, size_m: float) -> tuple[np.ndarray, float]:
+    """Return the signed distance of the training person ``number`` and their log scale."""
+    rng = np.random.default_rng([TRAINING, number])
+    person = sample_person(rng)
+    pose = sample_pose(rng, str(rng.choice(POSTURES, p=POSTURE_SHARES)))
+    size = rest(person)[0].head_size
+    scale = float(np.exp(np.log(size).mean()) / size_m)
+    return signed_distance(pose_person(person, pose), scale), float(np.log(scale))
+
+
+def mean_size_m(people: int) -> float:
+    """Return the geometric mean over depth, breadth and height of the training people's bald heads."""
+    persons = [sample_person(np.random.default_rng([TRAINING, number])) for number in range(people)]
+    return float(np.exp(np.mean([np.log(rest(person)[0].head_size).mean() for person in persons])))
+
+
+def learn(distances: np.ndarray, modes: int) -> dict[str, np.ndarray]:
+    """Return mean, modes and sigma of ``distances`` (people, voxels), which are mirrored here."""
+    people, distances = len(distances), distances.astype(np.float32)
+    mirrored = distances.reshape(people, *SHAPE)[:, :, ::-1].reshape(people, -1)
+    both = np.concatenate([distances, mirrored])
+    mean = both.mean(0)
+    both -= mean
+    spread = both.std(0)
+    weight = np.exp(-((mean / BAND_M) ** 2)) / (spread**2 + 0.008**2)
+    near = weight > 1e-3 * weight.max()
+    values, vectors = np.linalg.eigh((both[:, near] * weight[near]) @ both[:, near].T)
+    print("share explained", np.round(values[::-1][:12] / values.sum(), 3).tolist())
+    scores = vectors[:, ::-1][:, :modes] * np.sqrt(2 * people)  # unit variance
+    shapes = scores.T @ both / (2 * people)
+    left = both - scores @ shapes
+    sigma = np.sqrt((left**2).mean(0))
+    smooth = gaussian_filter(sigma.reshape(SHAPE), 0.7).reshape(-1)
+    surface = np.abs(mean) < 0.01
+    print(
+        "sigma near the surface, median before and after the modes, mm",
+        1e3 * np.median(spread[surface]),
+        1e3 * np.median(sigma[surface]),
+    )
+    return {"mean": mean, "modes": shapes, "sigma": np.hypot(smooth, FLOOR_M)}
+
+
+def quantised(learnt: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of the asset, in whole numbers of a unit each."""
+    greatest = np.abs(learnt["modes"]).max(1)
+    return {
+        "mean": np.rint(learnt["mean"] / MEAN_UNIT_M).astype(np.int16).reshape(SHAPE),
+        "mean_unit_m": np.array(MEAN_UNIT_M),
+        "modes": np.rint(learnt["modes"] / greatest[:, None] * 127).astype(np.int8).reshape(-1, *SHAPE),
+        "mode_units_m": greatest / 127,
+        "sigma": np.clip(np.rint(learnt["sigma"] / SIGMA_UNIT_M), 1, 255).astype(np.uint8).reshape(SHAPE),
+        "sigma_unit_m": np.array(SIGMA_UNIT_M),
+        "low_m": LOW,
+        "voxel_m": np.array(VOXEL_M),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    root = Path(__file__).resolve().parent.parent
+    parser.add_argument("--out", type=Path, default=root / "src/headvox/assets/template.npz")
+    parser.add_argument("--people", type=int, default=400)
+    parser.add_argument("--modes", type=int, default=10)
+    parser.add_argument("--workers", type=int, default=1)
+    args = parser.parse_args()
+    size_m = mean_size_m(args.people)
+    made = list(in_processes(partial(head_of, size_m=size_m), range(args.people), args.workers))
+    print(f"mean size {size_m:.4f} m, log scale sigma {np.std([scale for _, scale in made]):.3f}")
+    asset = quantised(learn(np.array([distance for distance, _ in made]), args.modes))
+    np.savez_compressed(args.out, **asset, size_m=np.array(size_m))
+    print(f"{args.out.name}: {args.out.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -71,8 +71,9 @@ def linearise(samples, n, rays, m, most, modes, k, upright, rows, low, voxel_m, 
     lx, ly, lz = low[0] / voxel_m, low[1] / voxel_m, low[2] / voxel_m
     nx, ny, nz = rows.shape[0], rows.shape[1], rows.shape[2]
     size = 7 + modes
-    A[:] = 0.0
-    J[:] = 0.0
+    for i in range(size):
+        for j in range(PARAMETERS + 1):
+            A[i, j] = 0.0
     k2 = k * k
     cost = 0.0
     on = 0
@@ -157,7 +158,8 @@ def linearise(samples, n, rays, m, most, modes, k, upright, rows, low, voxel_m, 
         A[7 + i, 7 + i] += 1.0
         A[7 + i, RESIDUAL] += state[13 + i]
     if upright:  # r20 r21 r22 is the world's up in the head's axes
-        J[:] = 0.0
+        for i in range(size):
+            J[i] = 0.0
         w = 1.0 / (PITCH_SIGMA * PITCH_SIGMA)
         cost += w * r20 * r20
         J[4], J[5], J[RESIDUAL] = -r22, r21, r20
@@ -250,64 +252,69 @@ def align(samples, n, rays, m, starts, upright, rows, low, voxel_m, coarse, fine
     J = np.empty(PARAMETERS + 1)
     x = np.empty(PARAMETERS)
     scrap = np.empty(TOLD)
-    most = np.array([COARSE_SAMPLES, 0])
+    most = np.empty(2, np.int64)
+    most[0], most[1] = COARSE_SAMPLES, 0
     costs = np.zeros(starts.shape[0])
     size = 7 + COARSE_MODES
+    least = np.inf
     for i in range(starts.shape[0]):
-        coarse[i, :] = 0.0
-        coarse[i, 3:12] = starts[i]
-        if starts.shape[0] == 1:
-            break
-        for step in range(COARSE_STEPS):
-            k = COARSE_K - step
-            linearise(
-                samples,
-                n,
-                rays,
-                m,
-                most,
-                COARSE_MODES,
-                k,
-                upright,
-                rows,
-                low,
-                voxel_m,
-                coarse[i],
-                A,
-                J,
-                scrap,
-            )
-            _solve(A, x, size)
-            _move(coarse[i], x, size)
-        k = COARSE_K - COARSE_STEPS + 1
-        costs[i] = linearise(
-            samples, n, rays, m, most, COARSE_MODES, k, upright, rows, low, voxel_m, coarse[i], A, J, scrap
-        )
+        state = coarse[i]
+        for j in range(STATE):
+            state[j] = starts[i, j - 3] if 3 <= j < 12 else 0.0
+        if starts.shape[0] > 1:
+            for step in range(COARSE_STEPS + 1):
+                k = COARSE_K - min(step, COARSE_STEPS - 1)
+                costs[i] = linearise(
+                    samples,
+                    n,
+                    rays,
+                    m,
+                    most,
+                    COARSE_MODES,
+                    k,
+                    upright,
+                    rows,
+                    low,
+                    voxel_m,
+                    state,
+                    A,
+                    J,
+                    scrap,
+                )
+                if step < COARSE_STEPS:
+                    _solve(A, x, size)
+                    _move(state, x, size)
+        least = min(least, costs[i])
     most[0], most[1] = FINE_SAMPLES, FINE_RAYS
-    order = np.argsort(costs, kind="mergesort")
     refined = 0
-    for i in order:
-        if refined == fine.shape[0] or (refined >= 2 and costs[i] > costs[order[0]] + MARGIN):
+    while refined < fine.shape[0]:
+        best = 0
+        for i in range(starts.shape[0]):
+            if costs[i] < costs[best]:
+                best = i
+        if costs[best] == np.inf or (refined >= 2 and costs[best] > least + MARGIN):
             break
+        costs[best] = np.inf
         known = False
         for j in range(refined):
             trace = 0.0
             for q in range(3, 12):
-                trace += coarse[i, q] * fine[j, q]
+                trace += coarse[best, q] * fine[j, q]
             known = known or trace > ALIKE
         if known:
             continue
         state = fine[refined]
-        state[:] = coarse[i]
-        for step in range(FINE_STEPS):
-            k = FINE_K + (LAST_K - FINE_K) * step / (FINE_STEPS - 1)
-            linearise(samples, n, rays, m, most, MODES, k, upright, rows, low, voxel_m, state, A, J, scrap)
-            _solve(A, x, PARAMETERS)
-            _move(state, x, PARAMETERS)
-        cost = linearise(
-            samples, n, rays, m, most, MODES, LAST_K, upright, rows, low, voxel_m, state, A, J, told[refined]
-        )
-        told[refined, EVIDENCE] = cost + _solve(A, x, PARAMETERS)
+        for j in range(STATE):
+            state[j] = coarse[best, j]
+        cost = 0.0
+        for step in range(FINE_STEPS + 1):
+            k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
+            cost = linearise(
+                samples, n, rays, m, most, MODES, k, upright, rows, low, voxel_m, state, A, J, told[refined]
+            )
+            told[refined, EVIDENCE] = cost + _solve(A, x, PARAMETERS)
+            if step < FINE_STEPS:
+                _move(state, x, PARAMETERS)
         _invert(A, x, covariances[refined])
         refined += 1
     return refined

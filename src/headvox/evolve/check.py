@@ -42,7 +42,7 @@ class Outcome:
 
 
 def check(cascade: Path, views: Iterable[View], as_clouds: bool = False) -> Outcome:
-    """Run the detector over ``views``; ``as_clouds`` makes points of the depth images, so that nothing is known empty."""
+    """Run the detector over ``views``; ``as_clouds`` makes points of the depth images, so nothing is known empty."""
     detector = Detector(
         DetectorConfig(cascade=str(cascade), max_range_m=RANGE_M, min_score=LEAST_SCORE, refine="sphere")
     )

@@ -13,11 +13,12 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from headvox.config import DetectorConfig
+from headvox.config import DetectorConfig, TrackerConfig
 from headvox.data import Frame
 from headvox.errors import HeadvoxError
 from headvox.masks import load_cascade
 from headvox.pipeline import Detector
+from headvox.track import Tracker
 from headvox.warmup import warm_up
 from headvox_ros import outputs
 from headvox_ros.node import SensorNode, run
@@ -26,6 +27,8 @@ from headvox_ros.synchronise import NS
 
 PARAMETERS = [
     *parameters_of(DetectorConfig, "detector"),
+    Parameter("tracking", True, "Follow heads from frame to frame: ids, velocities, smooth places.", None),
+    *parameters_of(TrackerConfig, "track"),
     Parameter(
         "publish_tf", False, "Broadcast a frame head_ID for each head whose orientation is known.", None
     ),
@@ -38,6 +41,7 @@ class HeadDetector(SensorNode):
 
     def __init__(self) -> None:
         self._detector: Detector | None = None
+        self._tracker: Tracker | None = None
         super().__init__("head_detector", PARAMETERS)
         qos = QoSProfile(depth=5)
         self._poses = self.create_lifecycle_publisher(PoseArray, "~/poses", qos)
@@ -50,7 +54,8 @@ class HeadDetector(SensorNode):
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Refuse settings that the detector refuses."""
-        load_cascade(config_from(values, "detector").cascade)
+        load_cascade(config_from(DetectorConfig, "detector", values).cascade)
+        config_from(TrackerConfig, "track", values)
         if not any(topic for name in ("clouds", "depths") for topic in values[name]):
             raise HeadvoxError(
                 "There is no topic to listen to.",
@@ -59,33 +64,47 @@ class HeadDetector(SensorNode):
 
     def prepare(self) -> None:
         """Make the detector, and compile its loops."""
-        config = config_from(self.values, "detector")
+        values = self.values
+        config = config_from(DetectorConfig, "detector", values)
         warm_up(config)
         self._detector = Detector(config)
+        self._tracker = Tracker() if values["tracking"] else None
         self._board = outputs.MarkerBoard(self.get_parameter("marker_lifetime_s").value)
 
     def process(self, frame: Frame) -> None:
         """Find the heads of a frame and publish them, with the frame's stamp."""
-        heads = outputs.bare(self._current_detector().detect_frame(frame))
+        self._heed_parameters()
+        heads = self._look(frame)
+        seen = [head for head in heads if head.is_seen]
         header = Header(frame_id=self.get_parameter("target_frame").value)
         header.stamp.sec, header.stamp.nanosec = divmod(frame.stamp_ns, NS)
         if self._heads is not None:
-            self._heads.publish(outputs.detections(header, heads))
-        self._poses.publish(outputs.poses(header, heads))
+            self._heads.publish(outputs.detections(header, seen))
+        self._poses.publish(outputs.poses(header, seen))
         self._markers.publish(self._board.show(header, heads))
         for track in outputs.tracks(header, heads):
             self._tracks.publish(track)
         if self.get_parameter("publish_tf").value:
             self._tf.publish(TFMessage(transforms=outputs.frames(header, heads)))
 
-    def _current_detector(self) -> Detector:
-        """Return the detector that the parameters ask for: another one when they were changed."""
+    def _look(self, frame: Frame) -> list[outputs.HeadNow]:
         assert self._detector is not None
-        config = config_from(self.values, "detector")
+        if self._tracker is None:
+            return outputs.of_detections(self._detector.detect_frame(frame))
+        expected = self._tracker.expected(frame.stamp_ns)
+        heads = self._detector.detect_frame(frame, expected)
+        return outputs.of_tracks(self._tracker.update(heads, frame))
+
+    def _heed_parameters(self) -> None:
+        """Make another detector, and tell the tracker, when their parameters were changed."""
+        assert self._detector is not None
+        values = self.values
+        config = config_from(DetectorConfig, "detector", values)
         if config != self._detector.config:
             self._detector.close()
             self._detector = Detector(config)
-        return self._detector
+        if self._tracker is not None:
+            self._tracker.config = config_from(TrackerConfig, "track", values)
 
     def release(self) -> None:
         """End the detector's threads."""

@@ -16,24 +16,28 @@ from scipy.spatial.transform import Rotation
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from headvox.data import F64, Heads
+from headvox.data import F64, Heads, State, Tracks
 
 vision: Any = None
 with contextlib.suppress(ImportError):  # a ROS without vision_msgs: the topic is left out
     vision = importlib.import_module("vision_msgs.msg")
 
+GREY = (0.7, 0.7, 0.7)
 UNKNOWN_TURN_RAD2 = float(np.pi**2)  # variance about each axis of an orientation that is not known at all
-MARKER_KINDS = ("head", "axis", "label")  # namespaces
 WIDTH_TO_LENGTH = 0.8  # of a head; its length from forehead to back is that of the fitted sphere
 HEIGHT_TO_LENGTH = 1.2
 COLOURS = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.15, 0.16), (0.58, 0.4, 0.74))
 
 
 @dataclass(frozen=True, slots=True)
-class SeenHead:
-    """One head in the target frame; NaN where something is not known. ``id`` is from 1 on, 0 without a track."""
+class HeadNow:
+    """One head in the target frame; NaN where something is not known.
+
+    ``id`` is from 1 on, 0 without a track; ``is_seen`` says whether it was found in this very frame.
+    """
 
     id: int
+    is_seen: bool
     centre: F64
     quaternion: F64
     radius: float
@@ -49,26 +53,44 @@ class SeenHead:
         return bool(np.isfinite(self.quaternion).all())
 
 
-def bare(heads: Heads) -> list[SeenHead]:
+def of_detections(heads: Heads) -> list[HeadNow]:
     """Return detections as they are: without ids and velocities."""
     unknown, unknown3 = np.full(3, np.nan), np.full((3, 3), np.nan)
+    rows = zip(heads, heads.centre_covariances, heads.rotation_covariances, strict=True)
     return [
-        SeenHead(
-            0, head.centre, head.quaternion, head.radius, head.score, centre_cov, turn_cov, unknown, unknown3
+        HeadNow(0, True, h.centre, h.quaternion, h.radius, h.score, centre_cov, turn_cov, unknown, unknown3)
+        for h, centre_cov, turn_cov in rows
+    ]
+
+
+def of_tracks(tracks: Tracks) -> list[HeadNow]:
+    """Return what a tracker knows: heads it is not sure of yet (id 0), those it sees, and those it waits for."""
+    return [
+        HeadNow(
+            track.id,
+            track.state != State.COASTING,
+            track.centre,
+            track.quaternion,
+            track.radius,
+            track.score,
+            covariance[:3, :3],
+            turn_covariance,
+            np.asarray(track.velocity, dtype=np.float64),
+            covariance[3:, 3:],
         )
-        for head, centre_cov, turn_cov in zip(
-            heads, heads.centre_covariances, heads.rotation_covariances, strict=True
+        for track, covariance, turn_covariance in zip(
+            tracks, tracks.covariances, tracks.rotation_covariances, strict=True
         )
     ]
 
 
-def pose_of(head: SeenHead) -> Pose:
+def pose_of(head: HeadNow) -> Pose:
     """Return centre and orientation; an unknown orientation is that of the frame (a message must hold one)."""
     x, y, z, w = head.quaternion.tolist() if head.is_turned else (0.0, 0.0, 0.0, 1.0)
     return Pose(position=_point(head.centre), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
-def pose_covariance(head: SeenHead) -> list[float]:
+def pose_covariance(head: HeadNow) -> list[float]:
     """Return the 6x6 of geometry_msgs/PoseWithCovariance: x, y, z and turns about the fixed axes of the frame.
 
     An unknown position block is 0, ROS's "not known"; an unknown orientation has a variance of pi^2 rad^2.
@@ -90,12 +112,12 @@ def box_size(radius: float) -> Vector3:
     return Vector3(x=length, y=WIDTH_TO_LENGTH * length, z=HEIGHT_TO_LENGTH * length)
 
 
-def poses(header: Header, heads: Sequence[SeenHead]) -> PoseArray:
+def poses(header: Header, heads: Sequence[HeadNow]) -> PoseArray:
     """Return the poses, in the order of the detections."""
     return PoseArray(header=header, poses=[pose_of(head) for head in heads])
 
 
-def detections(header: Header, heads: Sequence[SeenHead]) -> Any:
+def detections(header: Header, heads: Sequence[HeadNow]) -> Any:
     """Return a vision_msgs/Detection3DArray: class "head", the cascade's score, the track's number as id."""
     found = []
     for head in heads:
@@ -110,7 +132,7 @@ def detections(header: Header, heads: Sequence[SeenHead]) -> Any:
     return vision.Detection3DArray(header=header, detections=found)
 
 
-def tracks(header: Header, heads: Sequence[SeenHead]) -> list[Odometry]:
+def tracks(header: Header, heads: Sequence[HeadNow]) -> list[Odometry]:
     """Return an Odometry for each head that has an id: its twist is in its own axes, as child_frame_id says."""
     messages = []
     for head in heads:
@@ -128,7 +150,7 @@ def tracks(header: Header, heads: Sequence[SeenHead]) -> list[Odometry]:
     return messages
 
 
-def frames(header: Header, heads: Sequence[SeenHead]) -> list[TransformStamped]:
+def frames(header: Header, heads: Sequence[HeadNow]) -> list[TransformStamped]:
     """Return the transform of each head that has an id and a known orientation."""
     made = []
     for head in heads:
@@ -140,7 +162,7 @@ def frames(header: Header, heads: Sequence[SeenHead]) -> list[TransformStamped]:
     return made
 
 
-def frame_of(head: SeenHead) -> str:
+def frame_of(head: HeadNow) -> str:
     """Return the name of a head's frame."""
     return f"head_{head.id}"
 
@@ -152,7 +174,7 @@ class MarkerBoard:
         self._lifetime = Duration(sec=int(lifetime_s), nanosec=int(lifetime_s % 1.0 * 1e9))
         self._shown: set[tuple[str, int]] = set()
 
-    def show(self, header: Header, heads: Sequence[SeenHead]) -> MarkerArray:
+    def show(self, header: Header, heads: Sequence[HeadNow]) -> MarkerArray:
         """Return the markers of ``heads``, and the deletion of those shown before and not now."""
         markers: list[Marker] = []
         for n, head in enumerate(heads):
@@ -163,10 +185,12 @@ class MarkerBoard:
         self._shown = now
         return MarkerArray(markers=markers)
 
-    def _markers(self, header: Header, head: SeenHead, number: int) -> list[Marker]:
-        colour = COLOURS[number % len(COLOURS)]
+    def _markers(self, header: Header, head: HeadNow, number: int) -> list[Marker]:
+        colour = COLOURS[number % len(COLOURS)] if head.id else GREY
         common = {"header": header, "id": number, "action": Marker.ADD, "lifetime": self._lifetime}
-        shape = Marker(**common, ns="head", pose=pose_of(head), color=_rgba(colour, 0.5))
+        shape = Marker(
+            **common, ns="head", pose=pose_of(head), color=_rgba(colour, 0.5 if head.is_seen else 0.2)
+        )
         if head.is_turned:
             shape.type, shape.scale = Marker.CUBE, box_size(head.radius)
         else:  # a cube would look turned

@@ -6,9 +6,9 @@ import ast
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
-from headvox.config import DetectorConfig, from_mapping
+from headvox.config import DetectorConfig, TrackerConfig
 from headvox.errors import HeadvoxError
 
 # What the configuration accepts (it checks for itself): told to tools that show sliders.
@@ -29,7 +29,10 @@ class Parameter:
     limits: tuple[float, float] | None
 
 
-def parameters_of(config: type[DetectorConfig], prefix: str) -> list[Parameter]:
+Config = TypeVar("Config", DetectorConfig, TrackerConfig)
+
+
+def parameters_of(config: type[Config], prefix: str) -> list[Parameter]:
     """Return a parameter ``prefix.NAME`` for each field of a configuration, in order."""
     texts = _descriptions(config)
     defaults = config()
@@ -41,7 +44,7 @@ def parameters_of(config: type[DetectorConfig], prefix: str) -> list[Parameter]:
     return made
 
 
-def config_from(values: Mapping[str, Any], prefix: str) -> DetectorConfig:
+def config_from(config: type[Config], prefix: str, values: Mapping[str, Any]) -> Config:
     """Return the configuration that the parameters ``prefix.NAME`` give; those that are None keep their default.
 
     Raises:
@@ -57,9 +60,9 @@ def config_from(values: Mapping[str, Any], prefix: str) -> DetectorConfig:
         if not isinstance(value, (str, bool, int, float)):
             given[key] = tuple(value)
     try:
-        return from_mapping(given, "parameters")
+        return config(**given)
     except HeadvoxError as error:
-        raise HeadvoxError(error.what.replace("Setting ", f"{prefix}."), error.do) from None
+        raise HeadvoxError(error.what.replace("Setting ", start), error.do) from None
 
 
 def _descriptions(config: type) -> dict[str, str]:

@@ -7,7 +7,6 @@ the true heads goes out on ``/true_heads``.
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 import time
@@ -32,6 +31,8 @@ from tf2_msgs.msg import TFMessage
 
 from headvox.data import F32, DepthImage, Frame
 from headvox.errors import HeadvoxError
+from headvox.evaluate.truth import FILE as TRUTH
+from headvox.evaluate.truth import read_truth
 from headvox.sources import open_source
 from headvox_ros.cloud_concatenate import as_message_data, cloud_message
 from headvox_ros.sensors import RELIABILITIES
@@ -104,31 +105,39 @@ class Player(Node):
         """Publish every frame at its time."""
         gone = [self._silence(text) for text in self.silent if text]
         time.sleep(self.delay_s)
+        skipped = 0
         start_s = time.monotonic() + 0.1
         start_ns = self.frames[0].stamp_ns if self.clock else time.time_ns() + NS // 10
         print(f"playing {len(self.frames)} frames from {start_ns} ns on", flush=True)
         for frame, since_ns in self._schedule():
             wait = start_s + 1e-9 * since_ns - time.monotonic()
-            if wait > 0.0:
-                time.sleep(wait)
+            if wait < -1e-9 * self._step_ns():  # a camera does not fall behind: what it cannot send is lost
+                skipped += 1
+                continue
+            time.sleep(max(wait, 0.0))
             again_ns = since_ns if not self.rewind else frame.stamp_ns - self.frames[0].stamp_ns
             now_s = 1e-9 * since_ns
             missing = {name for name, begin, end in gone if begin <= now_s < end}
             self._publish(frame, start_ns + again_ns, missing)
-        print("done", flush=True)
+        print(f"done, {skipped} frames skipped", flush=True)
 
     def _schedule(self) -> Iterator[tuple[Frame, int]]:
         """Yield each frame, and when it is due in nanoseconds from the start."""
+        step = self._step_ns()
         stamps = [frame.stamp_ns - self.frames[0].stamp_ns for frame in self.frames]
-        step = stamps[-1] // max(len(stamps) - 1, 1) or NS // 10
         if self.rate_hz > 0.0:
-            step = round(NS / self.rate_hz)
             stamps = [k * step for k in range(len(stamps))]
         number = 0
         while self.loops <= 0 or number < self.loops * len(stamps):
             loop, k = divmod(number, len(stamps))
             yield self.frames[k], loop * (stamps[-1] + step) + stamps[k]
             number += 1
+
+    def _step_ns(self) -> int:
+        """Return the time from frame to frame."""
+        count, first, last = len(self.frames), self.frames[0].stamp_ns, self.frames[-1].stamp_ns
+        as_recorded = (last - first) // (count - 1) if count > 1 else NS // 10
+        return int(NS / self.rate_hz) if self.rate_hz > 0.0 else as_recorded
 
     def _publish(self, frame: Frame, stamp_ns: int, missing: set[str]) -> None:
         stamp = Time(sec=stamp_ns // NS, nanosec=stamp_ns % NS)
@@ -222,21 +231,20 @@ def _place(image: DepthImage) -> TransformStamped:
 
 def _true_heads(folder: Path) -> dict[int, list[Pose]]:
     """Return the true heads of each labelled frame by its stamp; those to be ignored are left out."""
-    path = folder / "heads.jsonl"
+    path = folder / TRUTH
     if not path.exists():
         return {}
-    truth = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
-        poses = []
-        for head in row["heads"]:
-            if not head.get("ignore"):
-                x, y, z = map(float, head["centre"])
-                q = map(float, head.get("quaternion") or (0.0, 0.0, 0.0, 1.0))
-                quaternion = Quaternion(**dict(zip("xyzw", q, strict=True)))
-                poses.append(Pose(position=Point(x=x, y=y, z=z), orientation=quaternion))
-        truth[int(row["stamp_ns"])] = poses
-    return truth
+    return {
+        stamp: [
+            Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+            for (x, y, z), (qx, qy, qz, qw) in zip(
+                heads.centres[~heads.ignored].tolist(),
+                heads.quaternions[~heads.ignored].tolist(),
+                strict=True,
+            )
+        ]
+        for stamp, heads in read_truth(path).items()
+    }
 
 
 def main(arguments: list[str] | None = None) -> int:

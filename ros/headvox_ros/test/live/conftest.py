@@ -17,6 +17,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
@@ -27,7 +28,8 @@ import headvox
 
 PACKAGE = Path(__file__).resolve().parents[2]
 NS = 1_000_000_000
-START_S = 60.0  # the first run of a new version compiles
+START_S = 120.0  # the first run of a new version compiles
+WAIT_S = 60.0  # far more than it takes: machines that test are busy
 
 
 class Process:
@@ -51,7 +53,7 @@ class Process:
             self.interrupt()
         return self.wait()
 
-    def wait(self, timeout_s: float = 60.0) -> tuple[int, str]:
+    def wait(self, timeout_s: float = WAIT_S) -> tuple[int, str]:
         try:
             said, _ = self.process.communicate(timeout=timeout_s)
         except subprocess.TimeoutExpired:
@@ -83,7 +85,7 @@ class Robot:
         while (left := end - time.monotonic()) > 0.0:
             rclpy.spin_once(self.node, timeout_sec=left)
 
-    def wait(self, happened, seconds: float = 15.0, meanwhile=None, every_s: float = 0.1):
+    def wait(self, happened, seconds: float = WAIT_S, meanwhile=None, every_s: float = 0.1):
         """Spin until ``happened()`` is true, and return it; call ``meanwhile`` every so often."""
         end = time.monotonic() + seconds
         while not (result := happened()):
@@ -192,7 +194,7 @@ def ros():
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PACKAGE / "config" / "fastdds_large_clouds.xml")
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     yield
     rclpy.try_shutdown()
 
@@ -202,6 +204,22 @@ def robot():
     robot = Robot()
     yield robot
     robot.close()
+
+
+@pytest.fixture(scope="module")
+def start():
+    """Return a function that starts a node; whatever still runs at the end is killed."""
+    started: list[Process] = []
+
+    def start(module: str, *parameters: str) -> Process:
+        started.append(Process(module, *parameters))
+        return started[-1]
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            one.process.kill()
+            one.process.communicate()
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import NS, START_S, Process, stamp_of, xyz
+from conftest import NS, START_S, stamp_of, xyz
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray
 from rosgraph_msgs.msg import Clock
@@ -25,18 +25,18 @@ def truth(sample):
 
 
 @pytest.fixture(scope="module")
-def heard(robot, sample):
+def heard(robot, start, sample):
     """What is to be heard while the sample is played once to a node that takes depth images."""
     robot.listen(Detection3DArray, "/head_detector/heads")
     robot.listen(PoseArray, "/true_heads")
     robot.listen(Clock, "/clock")
-    node = Process("head_detector", DEPTHS, "target_frame:=world", "use_sim_time:=true", "sync_wait_s:=0.5")
+    node = start("head_detector", DEPTHS, "target_frame:=world", "use_sim_time:=true", "sync_wait_s:=0.5")
     robot.wait(lambda: robot.node.count_publishers("/head_detector/poses") > 0, START_S)
     robot.wait(lambda: robot.node.count_subscribers("/left/depth/image_rect_raw") > 0, START_S)
-    player = Process(
-        "play_recording", f"recording:={sample}", "clock:=true", "loops:=1", "rate_hz:=5.0", "delay_s:=3.0"
+    player = start(
+        "play_recording", f"recording:={sample}", "clock:=true", "loops:=1", "rate_hz:=4.0", "delay_s:=3.0"
     )
-    robot.wait(lambda: len(robot.got["/true_heads"]) >= 24, 30.0)
+    robot.wait(lambda: player.process.poll() is not None)
     robot.spin(1.5)
     assert player.wait()[0] == 0
     code, said = node.end()
@@ -47,8 +47,7 @@ def heard(robot, sample):
 def test_every_message_bears_the_stamp_and_the_frame_of_its_input(heard, truth):
     stamps = [stamp_of(message) for message in heard["/head_detector/heads"]]
     sent = [stamp_of(message) for message in heard["/true_heads"]]
-    assert len(sent) == 24
-    assert len(stamps) >= 22
+    assert len(stamps) > 0.7 * len(sent) > 8  # 24 where there is time for all
     assert stamps == sorted(set(stamps))
     assert set(stamps) <= set(sent)
     for topic in ("/head_detector/heads", "/head_detector/poses"):
@@ -120,27 +119,32 @@ def test_time_is_that_of_the_recording(heard):
     assert set(times) == {stamp_of(message) for message in heard["/true_heads"]}
 
 
-def test_the_fused_cloud_is_that_of_both_cameras(robot, sample, frames):
+def test_the_fused_cloud_is_that_of_both_cameras(robot, start, sample, frames):
     robot.listen(PointCloud2, "/cloud_concatenate/cloud")
-    node = Process(
+    node = start(
         "cloud_concatenate", CLOUDS, "target_frame:=world", "sync_wait_s:=0.5",
-        "publish_reliability:=reliable", "rate_hz:=3.0",
+        "publish_reliability:=reliable", "rate_hz:=1.5",
     )  # fmt: skip
     robot.wait(lambda: robot.node.count_subscribers("/left/depth/points") > 0, START_S)
-    player = Process(
-        "play_recording", f"recording:={sample}", "clock:=true", "loops:=1", "clouds:=true", "depths:=false"
+    player = start(
+        "play_recording",
+        f"recording:={sample}",
+        "clock:=true",
+        "loops:=1",
+        "clouds:=true",
+        "depths:=false",
+        "rate_hz:=5.0",
+        "delay_s:=3.0",
     )
     fused = robot.got["/cloud_concatenate/cloud"]
-    robot.wait(lambda: len(fused) >= 3, 30.0)
+    robot.wait(lambda: len(fused) >= 3)
     player.wait()
     code, said = node.end()
     assert code == 0, said
-    by_stamp = {frame.stamp_ns: frame for frame in frames}
     for message in fused[1:]:  # the first may come before the other camera is known
         assert message.header.frame_id == "world"
-        frame = by_stamp[stamp_of(message)]
+        frame = frames[stamp_of(message) * 5 // NS]
         points = np.frombuffer(message.data, np.float32).reshape(-1, 3)
         assert len(points) == sum(int((image.depth > 0).sum()) for image in frame.depths)
         assert np.isfinite(points).all()
-    gaps = np.diff([stamp_of(message) for message in fused])
-    assert gaps.min() >= 0.15 * NS  # 3 a second of 10
+    assert len(fused) < 16  # 1.5 of 5 a second

@@ -7,7 +7,8 @@ above zero where it is free. Every person counts twice, once mirrored. What is k
 
 - the mean signed distance;
 - its principal modes near the surface, hair and clothes weighing less than a face; the rest by regression;
-- the standard deviation of what the modes leave unexplained: small on a face, large on hair and shoulders.
+- the standard deviation of what the modes leave unexplained: small on a face, large on hair and shoulders;
+- how much surer a fit believes itself to be than it is, from fits of other simulated people in rooms.
 
 Identities are drawn from seeds of their own (``TRAINING``), which nothing that measures accuracy uses.
 
@@ -23,12 +24,16 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
+from headvox.align import EVIDENCE
 from headvox.data import Intrinsics
 from headvox.frames import inverse, transform
 from headvox.kernels import kernel
+from headvox.pose import Poses, Scratch, fit_pose
 from headvox.synth.people import PosedBody, pose_person, sample_person, sample_pose
 from headvox.synth.people import _rest as rest
+from headvox.synth.portraits import portrait
 from headvox.synth.processes import in_processes
 from headvox.synth.rays import Mesh, look
 
@@ -165,19 +170,75 @@ def quantised(learnt: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
+def odds_and_errors(number: int) -> tuple[np.ndarray, ...] | None:
+    """Fit the training view ``number``: evidence (S,) and yaw (S,) of its starts, from the best; the best one's yaw
+    variance, yaw error and squared error of the centre in its own covariance."""
+    rng = np.random.default_rng([TRAINING, 1, number])
+    distance, bearing, cameras = rng.uniform(0.8, 3.0), rng.uniform(-np.pi, np.pi), 1 + (rng.random() < 0.2)
+    view = portrait((TRAINING, 2, number), float(distance), float(bearing), int(cameras))
+    off = rng.normal(size=3)
+    start = view.head.centre + rng.uniform(0.02, 0.05) * off / np.linalg.norm(off)
+    scratch, poses = Scratch(), Poses.unknown(start[None])
+    best, count = fit_pose(view.frame, start, np.full(9, np.nan), scratch, poses, 0)
+    if count == 0:
+        return None
+    R = scratch.fine[:count, 3:12].reshape(-1, 3, 3)
+    turns = Rotation.from_matrix(R[best].T @ R).as_rotvec()
+    true = Rotation.from_quat(view.head.quaternion).as_matrix()
+    error = Rotation.from_matrix(R[best].T @ true).as_rotvec()[2]
+    shift = R[best].T @ (poses.centres[0] - view.head.centre)
+    covariance = scratch.covariances[best]
+    evidence = scratch.told[:count, EVIDENCE] - scratch.told[best, EVIDENCE]
+    return evidence, turns[:, 2], covariance[5, 5], error, shift @ np.linalg.solve(covariance[:3, :3], shift)
+
+
+def calibration(fits: list[tuple[np.ndarray, ...]]) -> np.ndarray:
+    """Return temperature, shift factor and turn factor (3,) that make what is stated true of ``fits``.
+
+    The factors bring the median of squared errors over variances to that of chi-squared; the temperature is the least
+    at which 98.5 % of the yaws that are stated to 15 degrees are right to 30.
+    """
+    variance = np.array([fit[2] for fit in fits])
+    error = np.abs([fit[3] for fit in fits])
+    right = error < np.radians(30.0)
+    turn = float(np.median(error[right] ** 2 / variance[right]) / 0.455)
+    shift = float(np.median([fit[4] for fit in fits]) / 2.366)
+    for temperature in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0):
+        odds = [np.exp(-fit[0] / temperature) for fit in fits]
+        others = [float(share @ fit[1] ** 2 / share.sum()) for share, fit in zip(odds, fits, strict=True)]
+        sure = np.sqrt(turn * variance + others) < np.radians(15.0)
+        print(
+            f"temperature {temperature:g}: {sure.mean():.0%} stated, {right[sure].mean():.1%} of them right"
+        )
+        if right[sure].mean() >= 0.985:
+            break
+    return np.array([temperature, max(shift, 1.0), max(turn, 1.0)])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     root = Path(__file__).resolve().parent.parent
     parser.add_argument("--out", type=Path, default=root / "src/headvox/assets/template.npz")
     parser.add_argument("--people", type=int, default=400)
     parser.add_argument("--modes", type=int, default=10)
+    parser.add_argument("--views", type=int, default=240, help="fits that the calibration is learnt from")
+    parser.add_argument("--calibrate-only", action="store_true", help="keep the shapes that are there")
     parser.add_argument("--workers", type=int, default=1)
     args = parser.parse_args()
-    size_m = mean_size_m(args.people)
-    made = list(in_processes(partial(head_of, size_m=size_m), range(args.people), args.workers))
-    print(f"mean size {size_m:.4f} m, log scale sigma {np.std([scale for _, scale in made]):.3f}")
-    asset = quantised(learn(np.array([distance for distance, _ in made]), args.modes))
-    np.savez_compressed(args.out, **asset, size_m=np.array(size_m))
+    if args.calibrate_only:
+        with np.load(args.out, allow_pickle=False) as known:
+            asset = {name: known[name] for name in known.files}
+    else:
+        size_m = mean_size_m(args.people)
+        made = list(in_processes(partial(head_of, size_m=size_m), range(args.people), args.workers))
+        print(f"mean size {size_m:.4f} m, log scale sigma {np.std([scale for _, scale in made]):.3f}")
+        asset = quantised(learn(np.array([distance for distance, _ in made]), args.modes))
+        asset |= {"size_m": np.array(size_m), "calibration": np.ones(3)}
+        np.savez_compressed(args.out, **asset)
+    fits = list(in_processes(odds_and_errors, range(args.views), args.workers))
+    asset["calibration"] = calibration([fit for fit in fits if fit is not None])
+    print("temperature, shift factor, turn factor:", asset["calibration"].round(2).tolist())
+    np.savez_compressed(args.out, **asset)
     print(f"{args.out.name}: {args.out.stat().st_size / 1e6:.2f} MB")
 
 

@@ -127,12 +127,18 @@ def expected_turns(centres: F64, expected: Expected | None) -> F64:
     return turns
 
 
-def fit_pose(frame: Frame, centre: F64, first: F64, scratch: Scratch, poses: Poses, i: int) -> None:
-    """Fit a head near ``centre`` (3,) and write it to row ``i`` of ``poses``."""
+def fit_pose(
+    frame: Frame, centre: F64, first: F64, scratch: Scratch, poses: Poses, i: int
+) -> tuple[int, int]:
+    """Fit a head near ``centre`` (3,) and write it to row ``i`` of ``poses``.
+
+    ``first`` (9,) is the rotation to start from, NaN where none is known. Returns which of the states in ``scratch`` is
+    the best, and how many there are: none where there are too few points.
+    """
     template = load_template()
     n, m = gather(frame, centre, scratch.samples, scratch.rays)
     if n < LEAST_SAMPLES:
-        return
+        return 0, 0
     refined = 0
     if np.isfinite(first).all():
         refined = _align(first.reshape(1, 9), True, n, m, template, scratch)
@@ -144,6 +150,7 @@ def fit_pose(frame: Frame, centre: F64, first: F64, scratch: Scratch, poses: Pos
         refined = _align(starts, not everywhere, n, m, template, scratch)
     best = int(np.argmin(scratch.told[:refined, EVIDENCE]))
     _settle(centre, best, refined, min(n, FINE_SAMPLES), min(m, FINE_RAYS), template, scratch, poses, i)
+    return best, refined
 
 
 def _align(starts: F64, upright: bool, n: int, m: int, template: Template, scratch: Scratch) -> int:

@@ -143,12 +143,11 @@ def main() -> None:
     for hard in ("hats", "drop-outs"):
         print(row(f"{hard}, all of the above", [r for r in results if r["hard"] == hard]))
     print(row("all", results))
-    for name, chosen in (("one view and more", results),):
-        print(f"\n{name}: {spread(chosen, 'ms')} ms a fit, {spread(chosen, 'tracked ms')} ms from a track,")
-        print(
-            f"then centre {spread(chosen, 'tracked centre')} mm, angle {spread(chosen, 'tracked angle')} deg"
-        )
-        print("mean shift, mm, head axes:", np.mean([r["shift"] for r in chosen], axis=0).round(1).tolist())
+    print(f"\n{spread(results, 'ms')} ms a fit, {spread(results, 'tracked ms')} ms from a track;")
+    print(
+        f"from a track: centre {spread(results, 'tracked centre')} mm, angle {spread(results, 'tracked angle')} deg"
+    )
+    print("mean shift, mm, head axes:", np.mean([r["shift"] for r in results], axis=0).round(1).tolist())
     if args.turns:
         shells = [
             r

@@ -250,6 +250,20 @@ def _masks_plot(args: argparse.Namespace) -> int:
     return GOOD
 
 
+def _masks_evolve(args: argparse.Namespace) -> int:
+    from headvox.evolve.search import Settings, evolve
+    from headvox.evolve.write import write_cascade
+
+    out = args.output or Path(f"{args.name}.toml")
+    if out.exists():
+        raise HeadvoxError(f"{out}: exists already.", "Give another file with -o, or move it away.")
+    settings = Settings(args.work, args.views, args.name, args.seed, args.rounds, args.workers)
+    found = evolve(settings, lambda text: print(text, file=sys.stderr, flush=True))
+    write_cascade(out, args.name, found)
+    print(printable(str(out)))
+    return GOOD
+
+
 def sample_folder() -> Path:
     """Return the recording that ships with headvox."""
     sample = Path(__file__).parent / "assets" / "sample"
@@ -370,6 +384,24 @@ def _add_masks(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     plot.add_argument(
         "-o", dest="output", type=Path, metavar="DIR", help="folder for the pictures (masks-NAME)"
     )
+    search = _command(actions, "evolve", _masks_evolve, "search for a cascade, with synthetic views")
+    search.add_argument("--views", type=whole_number, default=10_000, metavar="N", help="how many (10000)")
+    search.add_argument(
+        "--seed", type=seed_number, default=0, metavar="S", help="of the views and the search (0)"
+    )
+    search.add_argument(
+        "--rounds", type=whole_number, default=3, metavar="N", help="of hard negatives, at most (3)"
+    )
+    search.add_argument("--workers", type=whole_number, default=1, metavar="N", help="processes (1)")
+    search.add_argument("--name", default="evolved", help="of the cascade (evolved)")
+    search.add_argument(
+        "--work",
+        type=Path,
+        default=Path("evolve"),
+        metavar="DIR",
+        help="keeps the views: a search goes on from there (evolve)",
+    )
+    search.add_argument("-o", dest="output", type=Path, metavar="FILE", help="the cascade file (NAME.toml)")
 
 
 def _command(
@@ -443,6 +475,14 @@ def whole_number(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"expected at least 1, got {text!r}")
+    return value
+
+
+def seed_number(text: str) -> int:
+    """Return the whole number, at least 0, that ``text`` is."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected at least 0, got {text!r}")
     return value
 
 

@@ -1,24 +1,29 @@
 """The search, step by step: gate, search stages, judge stages, thresholds.
 
-Every step reads the views that :mod:`headvox.evolve.views` keeps on disk and leaves a cascade file in the work folder,
-so a stopped search goes on where it was. Whatever the number of processes, the same seed gives the same file.
+Rendering the views takes nearly all of the time, and they are kept in the work folder: a search that was stopped, or
+one with other settings, goes on from there. After each round of the judge there is a cascade file in the folder.
+Whatever the number of processes, the same seed gives the same file.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from headvox.errors import HeadvoxError
 from headvox.evolve import boost, gates
 from headvox.evolve.bank import SUBDIVISION, VOXEL_M
+from headvox.evolve.check import check
 from headvox.evolve.samples import (
     GateSums,
     Samples,
+    is_aside,
     join,
     judge_samples,
     of_bags,
@@ -26,68 +31,136 @@ from headvox.evolve.samples import (
     without_new_heads,
 )
 from headvox.evolve.views import View, keep_view
-from headvox.evolve.write import Found, cascade_text
-from headvox.masks import Cascade, CompiledCascade, CompiledGate, Condition, compile_cascade, parse_cascade
+from headvox.evolve.write import Found, cascade_text, write_cascade
+from headvox.masks import (
+    Cascade,
+    CompiledCascade,
+    CompiledGate,
+    Condition,
+    compile_cascade,
+    parse_cascade,
+)
 from headvox.synth.processes import in_processes
 
-GATE_LOSES, TIGHT_GATE_LOSES = 0.03, 0.004
 GATE_VIEWS = 3000
+GATE_LOSES, TIGHT_GATE_LOSES = 0.03, 0.004
+SEARCH_ROUNDS = 2
 PRUNED = 0.004
-JUDGE_MISSES = 0.10  # of the heads that the search leaves, when the search's thresholds are set
+JUDGE_MISSES = 0.10  # of the heads that the search leaves: what the stages before need not keep
 MINED = -4.0  # score of the judge from which a voxel that is no head is worth another look
+FALSE_A_FRAME = 0.02
+WORTH_A_ROUND = 0.002  # of recall
+
 Made = TypeVar("Made")
 Take = Callable[[View], Samples | None]
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to search with."""
+    """What to search with: ``views`` of ``seed``, kept in the folder ``work``, in so many processes."""
 
     work: Path
     views: int
+    name: str = "evolved"
     seed: int = 0
-    rounds: int = 2
+    rounds: int = 3
+    """Of the judge, at most: it ends when a round has not helped."""
     workers: int = 1
 
 
-def evolve(settings: Settings, say: Callable[[str], None]) -> Found:
-    """Search for a cascade; its thresholds are those that synthetic views kept aside ask for."""
+def evolve(settings: Settings, say: Say) -> Found:
+    """Search for a cascade, and return the best; its thresholds are set on the views kept aside.
+
+    Raises:
+        HeadvoxError: the folder holds views of another seed, too few views, or a library is missing.
+    """
+    _claim(settings)
     sums = gates.join_sums([s for s in _of_views(settings, GateSums.of, GATE_VIEWS) if s is not None])
     limits = gates.find_limits(sums, GATE_LOSES, settings.seed)
     gate = gates.as_conditions(limits, sums)
     say(f"gate: {_gate_text(limits, sums)}")
-
     every_voxel = _compile_gate(gate)
 
     def to_search(fitted: list[boost.Fitted]) -> Take:
-        return partial(
-            search_samples, gate=every_voxel, miner=_compile(gate, fitted).stages if fitted else None
-        )
+        miner = _compile(gate, fitted).stages if fitted else None
+        return partial(search_samples, gate=every_voxel, miner=miner)
+
+    *_, (samples, search) = _rounds(settings, SEARCH_ROUNDS, to_search, boost.SEARCH, say)
 
     def to_judge(fitted: list[boost.Fitted]) -> Take:
         passed = _compile(gate, search, fitted)
         assert passed.stages is not None
         return partial(judge_samples, gate=every_voxel, search=passed.stages, miner=passed.judge, least=MINED)
 
-    samples, search = _rounds(settings, settings.rounds, to_search, boost.SEARCH, say)
-    judged, judge = _rounds(settings, settings.rounds + 1, to_judge, boost.JUDGE, say)
-    least = boost.quantile_of_heads(judged, judge[-1].score, ~judged.aside & judged.sees, JUDGE_MISSES)
-    least_occupied = boost.quantile_of_heads(judged, judge[-2].score, ~judged.aside, JUDGE_MISSES)
-    accepted = _accepted(judged, judge, least, least_occupied)
+    best, best_recall = None, -1.0
+    for number, (judged, judge) in enumerate(
+        _rounds(settings, settings.rounds, to_judge, boost.JUDGE, say), 1
+    ):
+        found = _assemble(settings, sums, samples, search, judged, judge)
+        path = settings.work / f"round-{number}.toml"
+        write_cascade(path, settings.name, found)
+        found, recall = _with_thresholds(settings, path, found)
+        write_cascade(path, settings.name, found)
+        say(
+            f"round {number}: {100 * recall:.1f} % of the heads kept aside at {FALSE_A_FRAME:g} false a frame"
+        )
+        if recall < best_recall + WORTH_A_ROUND:
+            break
+        best, best_recall = found, recall
+    assert best is not None
+    return best
+
+
+def _claim(settings: Settings) -> None:
+    """Make the folder, or see that its views are of the same seed."""
+    if settings.views < 200:
+        what = f"--views: expected at least 200, of which 20 are kept aside, got {settings.views}."
+        raise HeadvoxError(what, "Thousands are better.")
+    (settings.work / "views").mkdir(parents=True, exist_ok=True)
+    note = settings.work / "search.json"
+    mine = {"format": "headvox-search", "version": 1, "seed": settings.seed}
+    if note.exists() and json.loads(note.read_text(encoding="utf-8")) != mine:
+        raise HeadvoxError(
+            f"{settings.work}: holds the views of another seed than {settings.seed}.",
+            "Give the same --seed, or another folder with --work.",
+        )
+    note.write_text(json.dumps(mine) + "\n", encoding="utf-8")
+
+
+def _assemble(
+    settings: Settings, sums: GateSums, samples: Samples, search: list[boost.Fitted], judged: Samples,
+    judge: list[boost.Fitted],
+) -> Found:  # fmt: skip
+    """Put the parts together, each no more patient than the heads that all of it accepts in the end ask for."""
+    search, judge = ([replace(stage) for stage in part] for part in (search, judge))
+    learnt = ~judged.aside
+    least = boost.quantile_of_heads(judged, judge[-1].score, learnt & judged.sees, JUDGE_MISSES)
+    least_occupied = boost.quantile_of_heads(judged, judge[-2].score, learnt, JUDGE_MISSES)
+    final = np.where(judged.sees, judge[-1].score - least, judge[-2].score - least_occupied)
+    heads, score = of_bags(judged, final, learnt)
+    accepted = heads[score >= 0.0]
     boost.prune(judge[:-1], judged, np.isin(judged.bag, accepted), PRUNED)
-    mine = ~samples.aside & np.isin(samples.bag // 16 * 16, accepted)
-    boost.prune(search, samples, mine, PRUNED)
-    bags = np.unique(samples.bag[mine])
-    limits = gates.find_limits(sums, TIGHT_GATE_LOSES, settings.seed, bags)
-    say(f"gate: {_gate_text(limits, sums)}")
-    return Found(gates.as_conditions(limits, sums), search, judge, least, least_occupied)
+    of_accepted = ~samples.aside & np.isin(samples.bag // 16 * 16, accepted)
+    boost.prune(search, samples, of_accepted, PRUNED)
+    limits = gates.find_limits(sums, TIGHT_GATE_LOSES, settings.seed, np.unique(samples.bag[of_accepted]))
+    return Found(gates.as_conditions(limits, sums), search, judge)
 
 
-def _accepted(samples: Samples, judge: list[boost.Fitted], least: float, least_occupied: float) -> np.ndarray:
-    """Return the heads that the judge accepts."""
-    final = np.where(samples.sees, judge[-1].score - least, judge[-2].score - least_occupied)
-    bags, best = of_bags(samples, final, ~samples.aside)
-    return bags[best >= 0.0]
+def _with_thresholds(settings: Settings, path: Path, found: Found) -> tuple[Found, float]:
+    """Return ``found`` with its thresholds and where they are from, and the recall at the first of them."""
+    numbers = np.arange(settings.views)
+    aside = numbers[is_aside(numbers)].tolist()
+    views = [keep_view(settings.work / "views", settings.seed, number) for number in aside]
+    outcome, occupied = check(path, views), check(path, views, as_clouds=True)
+    least, least_occupied = outcome.threshold(FALSE_A_FRAME), occupied.threshold(FALSE_A_FRAME)
+    given = f"synthetic views 0-{settings.views - 1} of seed {settings.seed}"
+    tuned_on = (
+        f"boosting: {given}, but those kept aside (180-199 of every 200)",
+        f"both thresholds: the {len(aside)} views kept aside, {FALSE_A_FRAME:g} false heads a frame",
+    )
+    found = replace(found, min_score=least, min_score_occupied=least_occupied, tuned_on=tuned_on)
+    return found, outcome.recall(least)
 
 
 def _gate_text(limits: gates.Limits, sums: GateSums) -> str:
@@ -96,23 +169,21 @@ def _gate_text(limits: gates.Limits, sums: GateSums) -> str:
 
 
 def _rounds(
-    settings: Settings,
-    rounds: int,
-    take: Callable[[list[boost.Fitted]], Take],
-    plans: tuple[boost.Plan, ...],
-    say: Callable[[str], None],
-) -> tuple[Samples, list[boost.Fitted]]:
+    settings: Settings, count: int, take: Callable[[list[boost.Fitted]], Take], plans: tuple[boost.Plan, ...], say: Say
+) -> Iterator[tuple[Samples, list[boost.Fitted]]]:  # fmt: skip
     """Fit, look for what the fit is wrong about, add it, fit again."""
     fitted: list[boost.Fitted] = []
     samples: Samples | None = None
-    for number in range(1, rounds + 1):
-        new = join(part for part in _of_views(settings, take(fitted)) if part is not None)
+    for _ in range(count):
+        parts = [part for part in _of_views(settings, take(fitted)) if part is not None]
+        if not parts:  # nothing is left that the last fit was wrong about
+            return
+        new = join(parts)
         samples = new if samples is None else join([samples, without_new_heads(new)])
         wrong = int((samples.label == 0).sum())
-        say(f"round {number}: {len(samples) - wrong} voxels of heads, {wrong} others")
+        say(f"samples: {len(samples) - wrong} voxels of heads, {wrong} others")
         fitted = boost.boost(samples, plans, settings.seed, say)
-    assert samples is not None
-    return samples, fitted
+        yield samples, fitted
 
 
 def _compile(
@@ -131,9 +202,9 @@ def _compile_gate(gate: tuple[Condition, ...]) -> CompiledGate:
 
 def _of_views(settings: Settings, take: Callable[[View], Made], most: int | None = None) -> Iterator[Made]:
     numbers = range(min(settings.views, most or settings.views))
-    folder = settings.work / "views"
-    folder.mkdir(parents=True, exist_ok=True)
-    yield from in_processes(partial(_take, folder, settings.seed, take), numbers, settings.workers)
+    yield from in_processes(
+        partial(_take, settings.work / "views", settings.seed, take), numbers, settings.workers
+    )
 
 
 def _take(folder: Path, seed: int, take: Callable[[View], Made], number: int) -> Made:

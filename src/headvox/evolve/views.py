@@ -153,6 +153,7 @@ def keep_view(folder: Path, seed: int, number: int) -> View:
     path = folder / f"{number:06d}.npz"
     if path.exists():
         return _read(path, number)
+    folder.mkdir(parents=True, exist_ok=True)
     view = make_view(seed, number)
     part = path.with_suffix(f".{os.getpid()}.part")
     _write(part, view)

@@ -81,6 +81,8 @@ def boost(samples: Samples, plans: tuple[Plan, ...], seed: int, say: Callable[[s
         pool = POOLS[plan.pool]
         if plan.pool == "seen":
             rows = rows & samples.sees
+        if not (rows & ~samples.aside & (samples.label == 1)).any():
+            raise HeadvoxError(f"Stage {plan.name}: no head is left to learn from.", "Give more views.")
         have = have + _choose(samples, plan, rows, score, have, seed)
         allowed = pool | POOLS["occupied"] if plan.pool == "seen" else pool
         columns = np.flatnonzero(np.isin(GROUP_OF, have) & allowed)

@@ -206,17 +206,18 @@ def judge_samples(
     label, _ = _label(view, grid.lattice.centres(about), JUDGE_NEAR_M)
     false = (label.reshape(-1, len(AROUND)) == 0).all(axis=1) if len(peaks) else np.zeros(0, bool)
     inside = inside.reshape(-1, len(AROUND))
+    scores = np.zeros(len(about), np.int64)
+    asked = np.flatnonzero(inside.reshape(-1) & np.repeat(false, len(AROUND)))
+    if miner is not None and len(asked):
+        scores[asked] = score_by_stages(grid.S, about[asked], miner)
     chosen: list[I64] = []
     for p in np.flatnonzero(false):
         mine = p * len(AROUND) + np.flatnonzero(inside[p])
         if miner is None:
-            if len(chosen) < MOST_PEAKS:
-                chosen.append(_few(mine, FEW_AROUND, rng))
-        else:
-            score = score_by_stages(grid.S, about[mine], miner, None)
-            best = mine[np.argsort(-score, kind="stable")[:2]]
-            if score.max(initial=DROPPED) >= least * SCORE_UNIT and len(chosen) < MOST_PEAKS:
-                chosen.append(best)
+            chosen.append(_few(mine, FEW_AROUND, rng))
+        elif scores[mine].max(initial=DROPPED) >= least * SCORE_UNIT:
+            chosen.append(mine[np.argsort(-scores[mine], kind="stable")[:2]])
+    chosen = chosen[:MOST_PEAKS]
     negative = about[np.concatenate(chosen)] if chosen else np.empty((0, 3), np.int32)
     heads = (
         [grid.near(centre, JUDGE_NEAR_M) for centre in view.heads.centres[to_find(view)]]

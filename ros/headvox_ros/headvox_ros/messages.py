@@ -38,7 +38,7 @@ def cloud_points(message: Any) -> F32:
     """Return the points of a sensor_msgs/PointCloud2, (N, 3) float32 metres in its frame, invalid ones not finite.
 
     The fields x, y and z may lie anywhere in a point and have any number type; the cloud may be organised, padded,
-    and of either byte order.
+    and of either byte order. Points that are as they should be already are not copied.
 
     Raises:
         HeadvoxError: a coordinate is missing or reaches beyond its point, the data is shorter than the header says, or
@@ -63,6 +63,11 @@ def cloud_points(message: Any) -> F32:
         columns.append(
             _column(data, fields[name], point_step, row_step, (height, width), message.is_bigendian)
         )
+    offsets = [fields[name].offset for name in ("x", "y", "z")]
+    if all(column.dtype == np.float32 for column in columns) and np.diff(offsets).tolist() == [4, 4]:
+        strides = (row_step, point_step, 4)
+        together = np.ndarray((height, width, 3), np.float32, data, offsets[0], strides)
+        return np.require(together, requirements=["C", "A"]).reshape(-1, 3)
     points = np.empty((height, width, 3), np.float32)
     with np.errstate(
         over="ignore", invalid="ignore"

@@ -186,9 +186,13 @@ class SensorNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Let go of everything, whatever the state."""
+        self.close()
+        return super().on_shutdown(state)
+
+    def close(self) -> None:
+        """Stop, and let go of everything: also in the middle of a transition."""
         self._stop()
         self.release()
-        return super().on_shutdown(state)
 
     def _stop(self) -> None:
         self._stopping.set()
@@ -297,7 +301,7 @@ def run(make: Callable[[], SensorNode], arguments: Sequence[str] | None = None) 
                 executor.spin_once(timeout_sec=0.1)
             code = int(node.failed)
         finally:
-            node.trigger_shutdown()
+            node.close()
             executor.shutdown()
             node.destroy_node()
     except KeyboardInterrupt:  # while it was still starting

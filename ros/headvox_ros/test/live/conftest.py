@@ -28,17 +28,23 @@ import headvox
 
 PACKAGE = Path(__file__).resolve().parents[2]
 NS = 1_000_000_000
-START_S = 120.0  # the first run of a new version compiles
+START_S = 240.0  # the first run of a new version compiles
 WAIT_S = 60.0  # far more than it takes: machines that test are busy
 
 
 class Process:
     """A node of the package, in a process of its own."""
 
-    def __init__(self, module: str, *parameters: str) -> None:
+    def __init__(self, module: str, *parameters: str, **environment: str) -> None:
         arguments = [part for parameter in parameters for part in ("-p", parameter)]
         command = [sys.executable, "-m", f"headvox_ros.{module}", "--ros-args", *arguments]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, **environment},
+        )
 
     @property
     def pid(self) -> int:
@@ -211,8 +217,8 @@ def start():
     """Return a function that starts a node; whatever still runs at the end is killed."""
     started: list[Process] = []
 
-    def start(module: str, *parameters: str) -> Process:
-        started.append(Process(module, *parameters))
+    def start(module: str, *parameters: str, **environment: str) -> Process:
+        started.append(Process(module, *parameters, **environment))
         return started[-1]
 
     yield start

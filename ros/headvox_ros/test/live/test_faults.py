@@ -453,3 +453,12 @@ def test_interrupted_in_mid_frame_it_ends_cleanly(robot, start, frames):
     assert not Path(f"/proc/{process.pid}").exists()
     own = {name for name in theirs if "port" not in name}  # ports are closed when both ends are
     assert not [name for name in own if Path(name).exists()]
+
+
+def test_interrupted_while_it_compiles_it_ends_cleanly(robot, start, tmp_path):
+    process = start("head_detector", "depths:=['/a/image']", NUMBA_CACHE_DIR=str(tmp_path))
+    robot.wait(lambda: any(tmp_path.rglob("*.nbi")), START_S)
+    process.interrupt()
+    code, said = process.wait(START_S)
+    assert code == 0, said
+    assert "Traceback" not in said, said

@@ -79,6 +79,25 @@ def test_the_field_types_are_those_of_ros():
     assert {code: np.dtype(name).itemsize for code, name in FIELD_TYPES.items()} == SIZES
 
 
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize(
+    ("point_step", "offset", "padding"), [(12, 0, 0), (16, 4, 0), (13, 1, 3), (12, 0, 8)]
+)
+def test_the_usual_layouts_equal_the_slow_twin(point_step, offset, padding, big):
+    row_step = 5 * point_step + padding
+    fields = [field(name, offset + 4 * k) for k, name in enumerate("xyz")]
+    message = cloud(
+        height=4, width=5, fields=fields, point_step=point_step, row_step=row_step, is_bigendian=big,
+        data=np.random.default_rng(0).bytes(4 * row_step),
+    )  # fmt: skip
+    points = cloud_points(message)
+    np.testing.assert_array_equal(points, points_one_by_one(message))
+    assert points.flags.c_contiguous
+    assert points.flags.aligned
+    plain = (point_step, padding, big) == (12, 0, False)
+    assert np.shares_memory(points, np.frombuffer(message.data, np.uint8)) == plain
+
+
 def test_what_float32_cannot_hold_is_no_point():
     data = struct.pack("<ddd", 1e300, float("nan"), 1.0)
     fields = [field("x", 0, 8), field("y", 8, 8), field("z", 16, 8)]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scenes
 
-from headvox.gate import pass_gate
-from headvox.integral import integral_volume
+from headvox.gate import gate_columns, gate_tables, list_passed, pass_gate, shape_of_passed
+from headvox.integral import box_reach, integral_volume, set_corners, with_margins
 from headvox.masks import (
     Box,
     Cascade,
@@ -213,3 +213,43 @@ def test_some_voxels_equal_the_naive_twin_and_the_lattices_together_are_the_whol
         assert 0 < len(found) < len(whole)
         together += map(tuple, found.tolist())
     assert sorted(together) == sorted([*map(tuple, whole.tolist())] * (8 // spacing))
+
+
+@pytest.mark.parametrize("spacing", [1, 2, 4])
+@pytest.mark.parametrize("shape", [(9, 8, 11), (11, 4, 33), (3, 5, 65)])
+def test_shares_of_a_part_of_the_volume_are_together_that_part(spacing, shape):
+    rng = np.random.default_rng(8)
+    cells = random_cells(rng, shape, 0.15)
+    condition = Condition(Group("some", (Box((0, 0, 0.02), (0.06, 0.06, 0.06)),)), 0, 0.01, 1.0)
+    cascade = Cascade("c", "c", 0.02, 2, False, (condition,), None, (), (), 0.0, 0.0, (), spacing=spacing)
+    gate = compile_cascade(cascade).gate
+    margin = -box_reach(gate.boxes)[0::2]
+    S = with_margins(integral_volume(cells), box_reach(gate.boxes))
+    corners = np.empty((len(gate.boxes), 8), np.uint64)
+    set_corners(S, gate.boxes, corners)
+    for odd in ((0, 0, 0), (1, 0, 1), (0, 1, 1)):
+        low = rng.integers(0, np.array(shape) // 2)
+        high = rng.integers(low + 1, shape, endpoint=True)
+        whole = naive.gate(naive.weights(cells), cascade, 0.02, odd)
+        wanted = whole[((whole >= low) & (whole < high)).all(axis=1)]
+        region = np.stack([low, high], axis=1).reshape(-1) + margin.repeat(2)
+        for parts in (1, 2, 3):
+            passed = np.full(shape_of_passed(region), 0xFFFFFFFF, np.uint32)  # what an earlier frame left
+            for part in range(parts):
+                gate_columns(
+                    S,
+                    region,
+                    part,
+                    parts,
+                    *gate_tables(gate, S.dtype),
+                    spacing,
+                    odd + margin,
+                    corners,
+                    passed,
+                )
+            survivors = np.empty((cells.size, 3), np.int32)
+            count = list_passed(passed, region, survivors)
+            np.testing.assert_array_equal(survivors[:count] - margin, wanted)
+            few = np.empty((count // 2, 3), np.int32)
+            assert list_passed(passed, region, few) == count
+            np.testing.assert_array_equal(few, survivors[: len(few)])

@@ -51,3 +51,22 @@ def test_an_error_in_any_call_reaches_the_caller_after_all_have_ended(count, bad
     threads.run(work, [(2,), (3,)])
     assert set(ended) >= {2, 3}
     threads.close()
+
+
+def test_threads_that_nobody_holds_end_by_themselves():
+    threads = Threads(3)
+    threads.run(lambda k: None, [(0,), (1,), (2,)])
+    others = threads._others
+    assert all(thread.is_alive() for thread in others)
+    del threads
+    for thread in others:
+        thread.join(timeout=30)
+    assert not any(thread.is_alive() for thread in others)
+
+
+def test_calls_after_closing_are_the_callers():
+    threads = Threads(2)
+    threads.close()
+    seen = []
+    threads.run(lambda: seen.append(threading.current_thread()), [(), ()])
+    assert seen == [threading.current_thread()] * 2

@@ -17,6 +17,7 @@ from headvox.kernels import bare_kernel, rule
 from headvox.masks import CompiledGate
 from headvox.simd import LANES, add, fill, less, load, lowest, sub, times, within
 
+SLICES = 4
 EVEN, ALL = np.uint32(0x55555555), np.uint32(0xFFFFFFFF)
 
 
@@ -30,10 +31,10 @@ def _sums(flat, at, corners, b):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def _holds(flat, at, corners, weights, start, rank, limits, i):  # type: ignore[no-untyped-def]
+def _holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[no-untyped-def]
     """Return a bit for each of :data:`LANES` voxels: whether condition ``i``'s statistic lies within its limits."""
     # Unsigned, because a signed index costs a check for counting from the end.
-    begin, end = np.uint64(start[i]), np.uint64(start[i + np.uint64(1)])
+    begin, end = np.uint64(spans[i, 0]), np.uint64(spans[i, 1])
     if rank[i] == 0:
         total = times(_sums(flat, at, corners, begin), weights[begin])
         for b in range(begin + np.uint64(1), end):
@@ -51,41 +52,57 @@ def _holds(flat, at, corners, weights, start, rank, limits, i):  # type: ignore[
 
 @bare_kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S, region, first, last, weights, start, rank, limits, spacing, odd, corners, survivors
+    S, region, part, parts, weights, spans, rank, limits, spacing, odd, corners, passed
 ):
-    """Write the voxels of the slices ``first`` to ``last`` that pass to ``survivors`` (n, 3); return how many.
+    """Write to ``passed`` (nx, ny, vectors a column) a bit for each voxel of ``region``: whether it passes.
 
-    ``region`` is y0 y1 z0 z1: the voxels of a slice that count. S has margins about them, see
-    :func:`headvox.integral.shape_with_margins`. With ``odd`` (3,) added to x, y and z, all voxels count (``spacing``
-    1), those whose x + y + z is even (2), or those whose x, y and z are all even or all odd (4). ``corners`` are those
-    of the gate's boxes. Counting goes on past the end of ``survivors``, so that the caller can tell how many did not
-    fit.
+    ``region`` is x0 x1 y0 y1 z0 z1; S has margins about it, see :func:`headvox.integral.shape_with_margins`. With
+    ``odd`` (3,) added to x, y and z, all voxels count (``spacing`` 1), those whose x + y + z is even (2), or those
+    whose x, y and z are all even or all odd (4). ``corners`` are those of the gate's boxes. Of ``parts`` shares of the
+    slices, the ``part``-th is done.
     """
     flat = S.reshape(-1)
-    bottom, height = region[2], region[3] - region[2]
+    x0, x1, y0, y1 = region[0], region[1], region[2], region[3]
+    bottom, height = region[4], region[5] - region[4]
+    # A few slices go side by side, because they share most of what their boxes look up.
+    for block in range(x0 + SLICES * part, x1, SLICES * parts):
+        for y in range(y0, y1):
+            for x in range(block, min(block + SLICES, x1)):
+                column = (x * S.shape[1] + y) * S.shape[2] + bottom
+                across = x + y + odd[0] + odd[1]
+                up = (across if spacing == 2 else x + odd[0]) + bottom + odd[2]
+                for k in range(passed.shape[2]):
+                    z = LANES * k
+                    alive = ALL if z + LANES <= height else ALL >> np.uint32(z + LANES - height)
+                    if spacing > 1:
+                        alive &= EVEN << np.uint32(up & 1)
+                    if spacing == 4 and across & 1:
+                        alive = np.uint32(0)
+                    for i in range(np.uint64(rank.shape[0])):
+                        if alive == 0:
+                            break
+                        alive &= _holds(flat, column + z, corners, weights, spans, rank, limits, i)
+                    passed[x - x0, y - y0, k] = alive
+
+
+@bare_kernel
+def list_passed(passed, region, survivors):  # type: ignore[no-untyped-def]
+    """Write the voxels of ``region`` whose bit is set to ``survivors`` (n, 3), in order; return how many there are.
+
+    Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
+    """
     found = 0
-    for x in range(first, last):
-        for y in range(region[0], region[1]):
-            across = x + y + odd[0] + odd[1]
-            if spacing == 4 and across & 1:
-                continue
-            up = (across if spacing == 2 else x + odd[0]) + bottom + odd[2]
-            column = (x * S.shape[1] + y) * S.shape[2] + bottom
-            for z in range(0, height, LANES):
-                alive = ALL if spacing == 1 else EVEN << np.uint32(up & 1)
-                for i in range(np.uint64(rank.shape[0])):
-                    alive &= _holds(flat, column + z, corners, weights, start, rank, limits, i)
-                    if alive == 0:
-                        break
-                while alive:
-                    voxel = z + lowest(alive)
-                    alive &= alive - np.uint32(1)
-                    if voxel < height:
-                        if found < survivors.shape[0]:
-                            survivors[found, 0] = x
-                            survivors[found, 1] = y
-                            survivors[found, 2] = bottom + voxel
-                        found += 1
+    for x in range(passed.shape[0]):
+        for y in range(passed.shape[1]):
+            for k in range(passed.shape[2]):
+                bits = passed[x, y, k]
+                while bits:
+                    if found < survivors.shape[0]:
+                        survivors[found, 0] = region[0] + x
+                        survivors[found, 1] = region[2] + y
+                        survivors[found, 2] = region[4] + LANES * k + lowest(bits)
+                    bits &= bits - np.uint32(1)
+                    found += 1
     return found
 
 
@@ -108,11 +125,24 @@ def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
 
 
 def gate_tables(gate: CompiledGate, sum_type: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
-    """Return the gate as :func:`gate_columns` reads it, for an integral volume of ``sum_type``."""
+    """Return the gate as :func:`gate_columns` reads it, for an integral volume of ``sum_type``.
+
+    The condition that asks most of a single box comes first: it throws out most for what it costs.
+    """
     signed = np.dtype(f"i{sum_type.itemsize}")
     least, greatest = np.iinfo(signed).min, np.iinfo(signed).max
     limits = np.clip(np.stack([gate.low, gate.high], axis=1), least, greatest).astype(signed)
-    return gate.weights, gate.start, gate.rank, limits
+    spans = np.stack([gate.start[:-1], gate.start[1:]], axis=1)
+    single = (np.diff(gate.start) == 1) & (gate.weights[gate.start[:-1]] == 1)
+    order = np.argsort(-np.where(single, gate.low, 0), kind="stable")
+    order = np.concatenate([order[:1], np.sort(order[1:])])
+    return gate.weights, spans[order], gate.rank[order], limits[order]
+
+
+def shape_of_passed(region: npt.NDArray[np.int64]) -> tuple[int, int, int]:
+    """Return the shape of the bits of ``region``, see :func:`gate_columns`."""
+    nx, ny, nz = (region[1::2] - region[0::2]).tolist()
+    return nx, ny, -(-nz // LANES)
 
 
 def pass_gate(S: Integral, gate: CompiledGate, odd: npt.ArrayLike = (0, 0, 0)) -> npt.NDArray[np.int32]:
@@ -121,15 +151,13 @@ def pass_gate(S: Integral, gate: CompiledGate, odd: npt.ArrayLike = (0, 0, 0)) -
     ``odd`` (3,) is that of the lattice, for a gate that does not look at every voxel.
     """
     reach = box_reach(gate.boxes)
-    longer = with_margins(S, reach)
     low = -reach[0::2]
-    high = low + S.shape - 1
-    corners = np.empty((len(gate.boxes), 8), np.uint64)
+    region = np.stack([low, low + S.shape - 1], axis=1).reshape(-1)
+    longer = with_margins(S, reach)
+    corners, passed = np.empty((len(gate.boxes), 8), np.uint64), np.empty(shape_of_passed(region), np.uint32)
     set_corners(longer, gate.boxes, corners)
-    region = np.array([low[1], high[1], low[2], high[2]])
-    arguments = (longer, region, low[0], high[0], *gate_tables(gate, S.dtype))
-    arguments += (gate.spacing, np.asarray(odd) + low, corners)
-    count = gate_columns(*arguments, np.empty((0, 3), np.int32))
-    survivors = np.empty((count, 3), np.int32)
-    gate_columns(*arguments, survivors)
+    tables = gate_tables(gate, S.dtype)
+    gate_columns(longer, region, 0, 1, *tables, gate.spacing, np.asarray(odd) + low, corners, passed)
+    survivors = np.empty((sum(int(bits).bit_count() for bits in passed[passed > 0]), 3), np.int32)
+    list_passed(passed, region, survivors)
     return survivors - low.astype(np.int32)

@@ -12,9 +12,12 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any
+from weakref import finalize
 
 import numba
 
@@ -62,27 +65,60 @@ def rule(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Threads:
-    """A fixed pool that runs one call a thread; with one thread it runs in the caller and costs nothing."""
+    """A fixed number of threads that run one call each; with one thread it runs in the caller and costs nothing."""
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self._pool = ThreadPoolExecutor(count - 1, "headvox") if count > 1 else None
+        # A plain queue wakes a thread in a few microseconds, a pool of the standard library in tens of them.
+        self._calls: _Calls = SimpleQueue()
+        self._others = [
+            Thread(target=_serve, args=(self._calls,), name="headvox", daemon=True) for _ in range(count - 1)
+        ]
+        for thread in self._others:
+            thread.start()
+        self._end = finalize(self, _end, self._calls, count - 1)
 
     def run(self, function: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> None:
         """Call ``function`` with each of ``calls``; returns, or raises, when all have ended."""
-        if self._pool is None or len(calls) < 2:
-            for arguments in calls:
-                function(*arguments)
-            return
-        others = [self._pool.submit(function, *arguments) for arguments in calls[1:]]
+        ends: SimpleQueue[BaseException | None] = SimpleQueue()
+        own = 1 if self._others else len(calls)
+        for arguments in calls[own:]:
+            self._calls.put((partial(function, *arguments), ends))
         try:
-            function(*calls[0])
+            for arguments in calls[:own]:
+                function(*arguments)
         finally:
-            wait(others)  # nobody may still write when the caller goes on
-        for other in others:
-            other.result()
+            errors = [ends.get() for _ in calls[own:]]  # nobody may still write when the caller goes on
+        for error in errors:
+            if error is not None:
+                raise error
 
     def close(self) -> None:
         """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._end()
+        for thread in self._others:
+            thread.join()
+        self._others = []
+
+
+_Calls = SimpleQueue[tuple[Callable[[], None], SimpleQueue[BaseException | None]] | None]
+
+
+def _serve(calls: _Calls) -> None:
+    while call := calls.get():
+        function, ends = call
+        ends.put(_error_of(function))
+        del call, function, ends  # what they refer to may be large
+
+
+def _error_of(function: Callable[[], None]) -> BaseException | None:
+    try:
+        function()
+    except BaseException as error:
+        return error
+    return None
+
+
+def _end(calls: _Calls, threads: int) -> None:
+    for _ in range(threads):
+        calls.put(None)

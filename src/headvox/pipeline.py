@@ -17,7 +17,7 @@ from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import candidate_reach, gate_columns, gate_tables
+from headvox.gate import candidate_reach, gate_columns, gate_tables, list_passed, shape_of_passed
 from headvox.integral import box_reach, integrate, set_corners, shape_with_margins
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, CompiledStages, compile_cascade, load_cascade
@@ -191,31 +191,23 @@ class Detector:
     def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: _Memory) -> I32:
         parts = self._threads.count
         low, high = candidates[:3] - memory.first, candidates[3:] - memory.first + 1
-        region = np.array([low[1], high[1], low[2], high[2]])
+        region = np.stack([low, high], axis=1).reshape(-1)
+        shape = shape_of_passed(region)
+        passed = memory.passed[: math.prod(shape)].reshape(shape)
         odd = memory.lattice.odd + memory.first
         set_corners(S, self.cascade.gate.boxes, memory.gate_corners)
-        found = [0] * parts
 
         def sweep(part: int) -> None:
-            begin, end = _share(int(high[0] - low[0]), part, parts)
-            arguments = (
-                S,
-                region,
-                low[0] + begin,
-                low[0] + end,
-                *memory.gate,
-                self.cascade.gate.spacing,
-                odd,
-            )
-            found[part] = gate_columns(*arguments, memory.gate_corners, memory.survivors[part])
-            if found[part] > len(memory.survivors[part]):
-                memory.survivors[part] = np.empty((2 * found[part], 3), np.int32)
-                gate_columns(*arguments, memory.gate_corners, memory.survivors[part])
+            gate_columns(
+                S, region, part, parts, *memory.gate, self.cascade.gate.spacing, odd, memory.gate_corners, passed
+            )  # fmt: skip
 
         self._threads.run(sweep, [(part,) for part in range(parts)])
-        lists = [survivors[:count] for survivors, count in zip(memory.survivors, found, strict=True)]
-        self.candidates = sum(found)
-        return lists[0] if parts == 1 else np.concatenate(lists)
+        self.candidates = list_passed(passed, region, memory.survivors)
+        if self.candidates > len(memory.survivors):
+            memory.survivors = np.empty((2 * self.candidates, 3), np.int32)
+            list_passed(passed, region, memory.survivors)
+        return memory.survivors[: self.candidates]
 
     def _vote(self, S: npt.NDArray[Any], survivors: I32, memory: _Memory) -> I64:
         memory.make_room(len(survivors))
@@ -451,7 +443,9 @@ class _Memory:
         self.gate = gate_tables(cascade.gate, self.S.dtype)
         self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.uint64)
         self.candidate_reach = candidate_reach(cascade.gate)
-        self.survivors = [np.empty((4096, 3), np.int32) for _ in range(threads)]
+        whole = np.array([0, lattice.shape[0], 0, lattice.shape[1], 0, lattice.shape[2]])
+        self.passed = np.empty(math.prod(shape_of_passed(whole)), np.uint32)
+        self.survivors = np.empty((4096, 3), np.int32)
         self.points = np.empty((MOST_PARTS, 3))
         self.unseen = np.zeros((1, 1, 2), np.int32)
         self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None

@@ -361,6 +361,43 @@ def count_seen(images, lattice: Lattice, cells, boxes) -> np.ndarray:
     return np.array(rows, np.int32).reshape(len(cells), len(boxes), 2)
 
 
+def see_place(image: DepthImage, place, sight: float) -> str:
+    """Return what one camera saw about ``place``, by the nine pixels of a grid 7 cm wide to either side."""
+    c, depth, T = image.intrinsics, image.depth, image.T_world_camera
+    K = np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]])
+    T_camera_world = np.column_stack([T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]])
+    A = K @ np.vstack([T_camera_world, [0.0, 0.0, 0.0, 1.0]])[:3]
+    x, y, z = place
+    uz, vz, far = (A[i, 0] * x + A[i, 1] * y + A[i, 2] * z + A[i, 3] for i in range(3))
+    if not 0.1 < far <= sight:
+        return "out of view"
+    seen = []
+    for i, j in product((-1, 0, 1), repeat=2):
+        column = math.floor(uz / far + i * 0.07 * c.fx / far + 0.5)
+        row = math.floor(vz / far + j * 0.07 * c.fy / far + 0.5)
+        if 0 <= column < c.width and 0 <= row < c.height:
+            measured = int(depth[row, column]) * c.depth_scale
+            if measured == 0:
+                seen.append("nothing")
+            elif measured > far + 0.15:
+                seen.append("beyond")
+            else:
+                seen.append("front" if measured < far - 0.25 else "about")
+    returns = len(seen) - seen.count("nothing")
+    if len(seen) < 5:
+        return "out of view"
+    if seen.count("beyond") >= 5 and seen.count("about") <= 1:
+        return "empty"
+    if returns < 5:
+        return "no return"
+    return "behind" if seen.count("front") > returns / 2 else "surface"
+
+
+def see_places(images, places, sight: float) -> list[int]:
+    order = ["out of view", "no return", "behind", "surface", "empty"]
+    return [max([order.index(see_place(i, place, sight)) for i in images], default=0) for place in places]
+
+
 # ----------------------------------------------------------------------------------------------------------- suppress
 
 

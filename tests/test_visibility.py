@@ -4,7 +4,7 @@ import pytest
 import scenes
 
 from headvox.data import DepthImage, Intrinsics
-from headvox.visibility import count_seen
+from headvox.visibility import BEHIND, NO_RETURN, OUT_OF_VIEW, SEEN_EMPTY, SURFACE, count_seen, see_places
 from headvox.voxelize import Lattice
 
 REGION = scenes.region(0.6, -0.3, 0.5)
@@ -128,3 +128,64 @@ def test_no_camera_no_candidate_no_box():
     none = np.empty((0, 3), np.int32)
     assert count_seen((), lattice, np.array([[1, 1, 1]], np.int32), BOXES).sum() == 0
     assert count_seen((), lattice, none, BOXES).shape == (0, 4, 2)
+
+
+# ---------------------------------------------------------------------------------------------------- places of heads
+
+SIGHT_M = 4.0
+
+
+SMALL = Intrinsics(40, 30, 35.0, 36.0, 19.6, 14.3)
+
+
+def patchy(rng, T, camera=SMALL):
+    """An image of patches at depths of their own, some without a return, and some single pixels of any kind."""
+    coarse = rng.choice([0, 600, 1500, 2000, 2100, 2800, 5000], (6, 8))
+    depth = np.kron(coarse, np.ones((5, 5), int))
+    odd = rng.random(depth.shape) < 0.2
+    depth[odd] = rng.integers(0, 5000, odd.sum())
+    return DepthImage("patchy", depth.astype(np.uint16), camera, T)
+
+
+def places_about(rng, camera, T, count):
+    """Places before, behind and beside a camera: on pixels and their borders, within its image and just out of it."""
+    far = rng.choice([-1.0, 0.05, 0.1, 0.8, 1.5, 2.0, 2.3, SIGHT_M, SIGHT_M + 0.2], count)
+    u = rng.integers(-6, 2 * camera.width + 6, count) / 2.0
+    v = rng.integers(-6, 2 * camera.height + 6, count) / 2.0
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(count)], 1)
+    return (far[:, None] * rays) @ T[:3, :3].T + T[:3, 3]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_places_equal_the_naive_twin(count):
+    rng = np.random.default_rng(20 + count)
+    T, aside = scenes.pose(rng), np.eye(4)
+    aside[0, 3] = 0.4
+    images = [patchy(rng, T @ np.linalg.matrix_power(aside, k)) for k in range(count)]
+    places = places_about(rng, SMALL, T, 3000)
+    seen = see_places(images, places, SIGHT_M)
+    np.testing.assert_array_equal(seen, naive.see_places(images, places, SIGHT_M))
+    kinds = (OUT_OF_VIEW, NO_RETURN, BEHIND, SURFACE, SEEN_EMPTY) if count else (OUT_OF_VIEW,)
+    assert min((seen == kind).sum() for kind in kinds) >= 8
+
+
+def test_places_without_a_turn_equal_the_naive_twin_on_the_borders_of_pixels():
+    """All numbers are exact in binary here, so a pixel's border and a depth's limit are hit, not only come near to."""
+    rng = np.random.default_rng(30)
+    image = patchy(rng, np.eye(4), Intrinsics(40, 30, 32.0, 32.0, 19.5, 14.5, 0.0009765625))
+    far = rng.choice([0.5, 1.0, 2.0, 4.0], 3000)
+    u, v = rng.integers(-4, 84, 3000) / 2.0, rng.integers(-4, 64, 3000) / 2.0
+    places = np.stack([(u - 19.5) / 32.0 * far, (v - 14.5) / 32.0 * far, far], 1)
+    seen = see_places([image], places, SIGHT_M)
+    np.testing.assert_array_equal(seen, naive.see_places([image], places, SIGHT_M))
+    assert min((seen == kind).sum() for kind in range(5)) >= 20
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "kind"), [(0.0, NO_RETURN), (1.0, BEHIND), (1.9, SURFACE), (3.0, SEEN_EMPTY)]
+)
+def test_what_is_seen_of_a_place_two_metres_away(depth_m, kind):
+    depth = np.full((30, 40), round(1000 * depth_m), np.uint16)
+    image = DepthImage("wall", depth, SMALL, np.eye(4))
+    places = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [5.0, 0.0, 2.0], [0.0, 0.0, 4.5]])
+    assert see_places([image], places, SIGHT_M).tolist() == [kind, OUT_OF_VIEW, OUT_OF_VIEW, OUT_OF_VIEW]

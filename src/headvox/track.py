@@ -40,9 +40,17 @@ SLACK_M = (
     0.03  # errors of a detector that stay for a while (hair, view): no noise to a filter, but room for a gate
 )
 NEAR_M, WALK_M_S, FARTHEST_M = 0.35, 1.2, 1.2  # a head is never sought farther than this from its prediction
-BACK_M, BACK_M_S, BACK_FARTHEST_M = 0.4, 0.3, 1.0  # nor farther than this from the way that it was lost on
+UP_M = 0.15  # nor farther than this above or below, nor from the height it was last seen at
+SAME_HEAD_M = 0.18  # two heads are not closer: what is found so near to a head is that head, however it moved
+KNOWN_M = 0.1  # a place is seen to be empty only where it is known as well as this
+BACK_M, BACK_M_S, BACK_FARTHEST_M = (
+    0.4,
+    1.0,
+    2.0,
+)  # a lost head is not farther than this from the way it was lost on
 BACK_HEIGHT_M = 0.1
 LEAST_REACH_M, MOST_REACH_M = 0.12, 0.4  # about an expected place
+FIRST_TRUST = 0.3
 MOST_DRAIN = 0.5  # of its life a track loses in one frame, however long: one miss never ends it
 NOT_A_PAIR = 1e6
 
@@ -53,6 +61,10 @@ TRACK = np.dtype(
         ("seen_ns", np.int64),
         ("hits", np.int64),  # a bit a frame, the last frame lowest
         ("life", np.float64),  # 1 when seen, dies at 0
+        (
+            "trust",
+            np.float64,
+        ),  # grows while it is seen, shrinks while its place is in plain view without it; so too
         ("lost", np.bool_),  # dead, but remembered
         ("place", np.float64, 3),  # where it was last seen, and how fast
         ("velocity", np.float64, 3),
@@ -135,8 +147,8 @@ class Tracker:
         table = self._predicted(stamp_ns)
         table = table[(table["id"] > 0) & ~table["lost"]]
         mean, cov = _combined(table)
-        widest = np.sqrt(np.trace(cov[:, :3, :3], axis1=1, axis2=2))
-        return Expected(mean[:, :3], table["q"].copy(), np.clip(3.0 * widest, LEAST_REACH_M, MOST_REACH_M))
+        reaches_m = np.clip(3.0 * _widest(cov), LEAST_REACH_M, MOST_REACH_M)
+        return Expected(mean[:, :3], table["q"].copy(), reaches_m)
 
     @property
     def ids_given(self) -> int:
@@ -173,10 +185,14 @@ class Tracker:
         mean, cov = _combined(table)
         squared, log_det = np.empty((2, len(table), len(heads)))
         compare(mean, cov, heads.centres, R + SLACK_M**2 * np.eye(3), squared, log_det)
-        far = np.linalg.norm(mean[:, None, :3] - heads.centres, axis=2)
-        unseen_s = (self._now() - table["seen_ns"]) * 1e-9
-        possible = squared <= self.config.gate_sigmas**2
-        possible &= far <= np.minimum(NEAR_M + WALK_M_S * unseen_s, FARTHEST_M)[:, None]
+        away = heads.centres - mean[:, None, :3]
+        far = np.linalg.norm(away, axis=2)
+        up = np.abs(heads.centres[:, 2] - table["place"][:, 2, None])
+        np.minimum(up, np.abs(away[:, :, 2]), out=up)
+        unseen_s = (self._now() - table["seen_ns"])[:, None] * 1e-9
+        possible = (squared <= self.config.gate_sigmas**2) | (far <= SAME_HEAD_M)
+        possible &= far <= np.minimum(NEAR_M + WALK_M_S * unseen_s, FARTHEST_M)
+        possible &= up <= UP_M
         possible &= ~table["lost"][:, None]
         possible &= (table["id"] > 0)[:, None] | heads.sure
         tracks, found = linear_sum_assignment(np.where(possible, squared + log_det, NOT_A_PAIR))
@@ -200,19 +216,24 @@ class Tracker:
     def _age(self, frame: Frame, dt: float, tracks: I64, sure: npt.NDArray[np.bool_]) -> None:
         """Let the tracks that were not surely seen lose life, by what the sensors saw of their places; end the dead."""
         config, table = self.config, self._table
-        limit_s = np.full(len(table), np.inf)
+        lasts_s = np.full(len(table), np.inf)
+        trusted_s = np.full(len(table), np.inf)
         missed = ~table["lost"]
         missed[tracks] = False
         if missed.any():
-            limits = np.empty(5)
-            limits[[OUT_OF_VIEW, NO_RETURN, SURFACE]] = config.out_of_view_s, config.missed_s, config.missed_s
-            limits[[BEHIND, SEEN_EMPTY]] = config.hidden_s, config.empty_s
-            mean, _ = _combined(table[missed])
-            limit_s[missed] = limits[look_for(frame, mean[:, :3], config.sight_m)]
-        limit_s[tracks[~sure]] = config.weak_s
-        table["life"] -= np.minimum(dt / limit_s, MOST_DRAIN)
+            limits = np.full(5, np.inf)
+            limits[[OUT_OF_VIEW, BEHIND, SEEN_EMPTY]] = config.out_of_view_s, config.hidden_s, config.empty_s
+            mean, cov = _combined(table[missed])
+            seen = look_for(frame, mean[:, :3], config.sight_m)
+            seen[(seen == SEEN_EMPTY) & (_widest(cov) > KNOWN_M)] = SURFACE
+            lasts_s[missed] = limits[seen]
+            trusted_s[missed] = np.where((seen == OUT_OF_VIEW) | (seen == BEHIND), np.inf, config.missed_s)
+        lasts_s[tracks[~sure]] = trusted_s[tracks[~sure]] = config.weak_s
+        trusted_s[tracks[sure]] = -config.missed_s
+        table["life"] -= np.minimum(dt / lasts_s, MOST_DRAIN)
         table["life"][tracks[sure]] = 1.0
-        dead = (table["life"] <= 0.0) & ~table["lost"]
+        table["trust"] = np.minimum(table["trust"] - np.minimum(dt / trusted_s, MOST_DRAIN), 1.0)
+        dead = (np.minimum(table["life"], table["trust"]) <= 0.0) & ~table["lost"]
         table["lost"] |= dead
         self._table = table[~(dead & (table["id"] == 0)) & self._may_be_confirmed()]
 
@@ -227,9 +248,9 @@ class Tracker:
     def _identify(self, n: int) -> int:
         """Return the id of the lost head that the new track ``n`` is, or else a new id."""
         table = self._table
-        lost = np.flatnonzero(table["lost"] & (table["id"] > 0))
+        lost = np.flatnonzero((table["id"] > 0) & (table["seen_ns"] < table["born_ns"][n]))
         if len(lost):
-            unseen_s = (table["born_ns"][n] - table["seen_ns"][lost]) * 1e-9
+            unseen_s = (table["seen_ns"][n] - table["seen_ns"][lost]) * 1e-9
             away = table["place"][n] - table["place"][lost]
             path = (
                 table["velocity"][lost] * unseen_s[:, None]
@@ -240,7 +261,6 @@ class Tracker:
             unlike = np.linalg.norm(
                 away / np.stack([reach, reach, np.full(len(lost), BACK_HEIGHT_M)], 1), axis=1
             )
-            unlike[unseen_s < 0.0] = np.inf
             best = int(np.argmin(unlike))
             if unlike[best] <= 1.0:
                 table["hits"][lost[best]] = 0
@@ -255,7 +275,7 @@ class Tracker:
         """Begin a track for each head of index ``new``."""
         born: Table = np.zeros(len(new), TRACK)
         born["born_ns"] = born["seen_ns"] = self._now()
-        born["hits"], born["life"] = 1, 1.0
+        born["hits"], born["life"], born["trust"] = 1, 1.0, FIRST_TRUST
         born["place"] = heads.centres[new]
         born["radius"], born["score"] = heads.radii[new], heads.scores[new]
         born["x"][:, :, :3] = heads.centres[new, None]
@@ -319,6 +339,11 @@ def _combined(table: Table) -> tuple[F64, F64]:
     mean, cov = np.empty((len(table), 6)), np.empty((len(table), 6, 6))
     combine(table["x"], table["P"], table["weight"], mean, cov)
     return mean, cov
+
+
+def _widest(cov: F64) -> F64:
+    """Return the standard deviation of each place, over all axes together [m]."""
+    return np.sqrt(np.trace(cov[:, :3, :3], axis1=1, axis2=2))
 
 
 def measurement_noise(heads: Heads, frame: Frame) -> tuple[F64, F64]:

@@ -87,7 +87,7 @@ class TrackerConfig:
     out_of_view_s: float = 0.5
     """... or is out of every sensor's view for so long ..."""
     missed_s: float = 1.0
-    """... or is in view, but nothing is found there ..."""
+    """... or is in view, but nothing is found there (one just begun, or seen in few frames, ends sooner) ..."""
     weak_s: float = 2.0
     """... or only what scores too little to be a head by itself ..."""
     hidden_s: float = 3.0

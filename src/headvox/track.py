@@ -138,14 +138,13 @@ class Tracker:
                 f"Expected a stamp from {self.stamp_ns} ns on, the last frame's, got {stamp_ns} ns.",
                 "Ask for the present or the future.",
             )
-        return self._report(self._predicted(stamp_ns), stamp_ns)
+        return self._report(self._predicted(~self._table["lost"], stamp_ns), stamp_ns)
 
     def expected(self, stamp_ns: int) -> Expected:
         """Return where confirmed heads are expected at ``stamp_ns``, for :meth:`Detector.detect_frame`."""
         if self.stamp_ns is None or stamp_ns < self.stamp_ns:
             return Expected(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
-        table = self._predicted(stamp_ns)
-        table = table[(table["id"] > 0) & ~table["lost"]]
+        table = self._predicted((self._table["id"] > 0) & ~self._table["lost"], stamp_ns)
         mean, cov = _combined(table)
         reaches_m = np.clip(3.0 * _widest(cov), LEAST_REACH_M, MOST_REACH_M)
         return Expected(mean[:, :3], table["q"].copy(), reaches_m)
@@ -172,7 +171,7 @@ class Tracker:
         """Move every track on to ``stamp_ns``; return the seconds since the last frame."""
         dt = 0.0 if self.stamp_ns is None else (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
-        self._table = self._table[stamp_ns - self._table["seen_ns"] <= self._longest_s() * 1e9]
+        self._keep(stamp_ns - self._table["seen_ns"] <= self._longest_s() * 1e9)
         self._table["hits"] = (self._table["hits"] << 1) & (2**self.config.confirm_frames - 1)
         self._move(self._table, dt)
         return dt
@@ -235,7 +234,7 @@ class Tracker:
         table["trust"] = np.minimum(table["trust"] - np.minimum(dt / trusted_s, MOST_DRAIN), 1.0)
         dead = (np.minimum(table["life"], table["trust"]) <= 0.0) & ~table["lost"]
         table["lost"] |= dead
-        self._table = table[~(dead & (table["id"] == 0)) & self._may_be_confirmed()]
+        self._keep(~(dead & (table["id"] == 0)) & self._may_be_confirmed())
 
     def _may_be_confirmed(self) -> npt.NDArray[np.bool_]:
         """Confirm what was seen often enough; return False for what can no longer be."""
@@ -273,6 +272,8 @@ class Tracker:
 
     def _bear(self, heads: Heads, R_centre: F64, R_turn: F64, new: I64) -> None:
         """Begin a track for each head of index ``new``."""
+        if len(new) == 0:
+            return
         born: Table = np.zeros(len(new), TRACK)
         born["born_ns"] = born["seen_ns"] = self._now()
         born["hits"], born["life"], born["trust"] = 1, 1.0, FIRST_TRUST
@@ -296,6 +297,10 @@ class Tracker:
         assert self.stamp_ns is not None
         return self.stamp_ns
 
+    def _keep(self, rows: npt.NDArray[np.bool_]) -> None:
+        if not rows.all():  # a table of many fields is slow to copy
+            self._table = self._table[rows]
+
     def _longest_s(self) -> float:
         """How long any track may be unseen and still be something."""
         config = self.config
@@ -308,18 +313,16 @@ class Tracker:
         predict_places(table["x"], table["P"], table["weight"], dt, STILL_S, MOVING_S, WANDER_M2_S, density)
         predict_turns(table["q"], table["rate"], table["C"], dt, turn_density)
 
-    def _predicted(self, stamp_ns: int) -> Table:
-        table = self._table.copy()
+    def _predicted(self, rows: npt.NDArray[np.bool_], stamp_ns: int) -> Table:
+        table = self._table[rows]
         if self.stamp_ns is not None:
             self._move(table, (stamp_ns - self.stamp_ns) * 1e-9)
         return table
 
     def _report(self, table: Table, stamp_ns: int) -> Tracks:
         """Return the living rows of ``table`` as tracks, those with an id first."""
-        table = table[~table["lost"]]
-        table = table[
-            np.argsort(np.where(table["id"] > 0, table["id"], np.iinfo(np.int64).max), kind="stable")
-        ]
+        order = np.argsort(np.where(table["id"] > 0, table["id"], np.iinfo(np.int64).max), kind="stable")
+        table = table[order[~table["lost"][order]]]
         mean, cov = _combined(table)
         unseen_s = (stamp_ns - table["seen_ns"]) * 1e-9
         states = np.where(table["seen_ns"] == self.stamp_ns, State.CONFIRMED, State.COASTING)
@@ -343,7 +346,8 @@ def _combined(table: Table) -> tuple[F64, F64]:
 
 def _widest(cov: F64) -> F64:
     """Return the standard deviation of each place, over all axes together [m]."""
-    return np.sqrt(np.trace(cov[:, :3, :3], axis1=1, axis2=2))
+    widest: F64 = np.sqrt(np.trace(cov[:, :3, :3], axis1=1, axis2=2))
+    return widest
 
 
 def measurement_noise(heads: Heads, frame: Frame) -> tuple[F64, F64]:

@@ -11,7 +11,6 @@ import argparse
 import gc
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -20,29 +19,26 @@ import tracemalloc
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from headvox import __version__
+from headvox.bench_input import SHELL_POINTS, Input, describe_machine, load_average, make_input
+from headvox.bench_report import report
 from headvox.cli import whole_number
 from headvox.config import DetectorConfig
-from headvox.data import F32, F64, DepthImage, Heads, Intrinsics
+from headvox.data import F32, F64, Heads, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.masks import compile_cascade, parse_cascade
 from headvox.pipeline import Detector
-from headvox.table import table
 from headvox.warmup import warm_up
 
 Values = dict[str, Any]
 
-SEED = 2
 MAX_RANGE_M = 3.5
 CENTRE = (0.0, 0.0, 1.65)  # between the cameras
-SHELL_POINTS = 9000
-SHELL_REACH_M = 0.155
 SHARES = (8, 4, 2, 1)  # every 8th point, every 4th, ...
 BOX_VOXELS = (3, 5, 9, 13, 17, 21)
 BURST = 5  # calls in a row, the first of which is cold
@@ -94,49 +90,6 @@ ready = time.perf_counter()
 detector.detect_depth(images)
 print(ready - read, time.perf_counter() - ready, time.perf_counter() - begun)
 """
-
-
-# -------------------------------------------------------------------------------------------------- the input
-
-
-@dataclass(frozen=True, slots=True)
-class Input:
-    """What is measured on: the same room as two depth images and as a cloud (N, 3) in the world, and a head alone."""
-
-    images: tuple[DepthImage, ...]
-    cloud: F32
-    shell: F32
-    people: int
-
-
-def make_input(small: bool = False) -> Input:
-    """Return three people in a furnished room before two cameras, 4 m apart, 1.65 m high, that face the middle.
-
-    The cameras are 848x480, or 424x240 if ``small``; the bytes are the same every time.
-    """
-    from headvox.frames import unproject
-    from headvox.mesh import sample_surface
-    from headvox.synth.presets import two_cameras
-
-    postures = ("standing", "walking", "sitting")
-    mode = "d435i-small" if small else "d435i"
-    scene = two_cameras(SEED, None, 0.1, postures, ("stay",) * len(postures), mode)
-    frame, _ = scene.frame(0)
-    points = [unproject(image.depth, image.intrinsics, image.T_world_camera) for image in frame.depths]
-    body = scene.actors[0].body(scene.people, 0)
-    T = body.T_world_head
-    local = (body.vertices - T[:3, 3]) @ T[:3, :3]
-    middle = local[body.faces].mean(axis=1)
-    is_head = ((middle**2).sum(axis=1) < SHELL_REACH_M**2) & (middle[:, 2] > -0.11)
-    used, corners = np.unique(body.faces[is_head], return_inverse=True)
-    shell = sample_surface(local[used], corners.reshape(-1, 3), 0.004)
-    chosen = np.linspace(0, len(shell) - 1, SHELL_POINTS).round().astype(np.int64)
-    return Input(
-        frame.depths,
-        np.ascontiguousarray(np.concatenate(points), dtype=np.float32),
-        np.ascontiguousarray(shell[chosen]),
-        len(postures),
-    )
 
 
 # ------------------------------------------------------------------------------------------------- the rounds
@@ -216,13 +169,14 @@ def measure(cascade: str, rounds: int, frames: int, small: bool, note: Callable[
             return stack.enter_context(closing(Detector(settings)))
 
         clouds, depth, depth_2, shell = (detector(settings) for settings in (config, config, two, alone))
-        cases = [
-            Case("detect, cloud", lambda: clouds.detect(data.cloud), clouds),
-            Case("detect_depth", lambda: depth.detect_depth(data.images), depth),
-            Case("detect_depth, 2 threads", lambda: depth_2.detect_depth(data.images), depth_2),
-            Case(f"detect, shell of {SHELL_POINTS}", lambda: shell.detect(data.shell), shell),
-            *_yardsticks(data, open3d),
-        ]
+        calls: dict[str, tuple[Detector, Callable[[], Heads]]] = {
+            "detect, cloud": (clouds, lambda: clouds.detect(data.cloud)),
+            "detect_depth": (depth, lambda: depth.detect_depth(data.images)),
+            "detect_depth, 2 threads": (depth_2, lambda: depth_2.detect_depth(data.images)),
+            f"detect, shell of {SHELL_POINTS}": (shell, lambda: shell.detect(data.shell)),
+        }
+        detections = [Case(name, call, detector) for name, (detector, call) in calls.items()]
+        cases = [*detections, *_yardsticks(data, open3d)]
         parts = [(len(points), points) for points in (data.cloud[::step].copy() for step in SHARES)]
         by_points = [_case_of_points(count, points, detector(config)) for count, points in parts]
         by_boxes = [_case_of_boxes(voxels, data, detector(config)) for voxels in BOX_VOXELS]
@@ -230,11 +184,11 @@ def measure(cascade: str, rounds: int, frames: int, small: bool, note: Callable[
         run_rounds([*cases, *by_points, *by_boxes], rounds)
         note(f"watching the memory over {frames} frames")
         memory = _memory(depth, data, frames)
-        found = {case.name: len(case.call()) for case in cases[:4]}  # type: ignore[arg-type]
+        found = {name: len(call()) for name, (_, call) in calls.items()}
         same = _same(depth.detect_depth(data.images), depth_2.detect_depth(data.images))
     note("starting fresh processes")
     first = _first_result(data, cascade, 1 if small else 5)
-    machine["load_average_after"] = _load_average()
+    machine["load_average_after"] = load_average()
     copy, grid = (
         next((case.ms for case in cases if case.name == name and case.ms), None) for name in (COPY, OPEN3D)
     )
@@ -251,6 +205,7 @@ def measure(cascade: str, rounds: int, frames: int, small: bool, note: Callable[
             "max_range_m": MAX_RANGE_M,
         },
         "rounds": rounds,
+        "calls_in_a_row": BURST,
         "ms": {
             case.name: {
                 **_percentiles(case.ms),
@@ -266,7 +221,7 @@ def measure(cascade: str, rounds: int, frames: int, small: bool, note: Callable[
         "same_heads_with_2_threads": same,
         "candidates": {"detect, cloud": clouds.candidates, "detect_depth": depth.candidates},
         "stages_ms": {
-            case.name: {stage: _percentiles(ms) for stage, ms in case.stages.items()} for case in cases[:4]
+            case.name: {stage: _percentiles(ms) for stage, ms in case.stages.items()} for case in detections
         },
         "by_points": _by_points(by_points, parts),
         "by_box_size": _by_box_size(by_boxes),
@@ -411,132 +366,6 @@ def _same(one: Heads, other: Heads) -> bool:
 
 def _ratio(ms: list[float], yardstick: list[float] | None) -> float | None:
     return None if not yardstick else round(float(np.median(ms) / np.median(yardstick)), 4)
-
-
-# ------------------------------------------------------------------------------------------------- the machine
-
-
-def describe_machine() -> Values:
-    """Return what a time depends on: processor, cores, versions, and how busy it is."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "cores_for_this_process": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "numpy": version("numpy"),
-        "numba": version("numba"),
-        "load_average": _load_average(),
-    }
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _load_average() -> list[float] | None:
-    return [round(v, 2) for v in os.getloadavg()] if hasattr(os, "getloadavg") else None
-
-
-# -------------------------------------------------------------------------------------------------- the report
-
-
-def report(result: Values) -> str:
-    """Return what :func:`measure` found, as tables."""
-    machine, data = result["machine"], result["input"]
-    cores = f"{machine['cores_for_this_process'] or machine['cores']} of {machine['cores']} cores"
-    versions = f"Python {machine['python']}, numpy {machine['numpy']}, numba {machine['numba']}"
-    head = [
-        ["machine", f"{machine['processor']}, {cores}, {machine['system']}"],
-        ["software", f"headvox {result['headvox']}, {versions}"],
-        [
-            "load average",
-            f"{_loads(machine['load_average'])} before, {_loads(machine['load_average_after'])} after",
-        ],
-        ["cascade", result["cascade"]],
-        [
-            "input",
-            f"{len(data['cameras'])} depth images of {data['cameras'][0]}, {data['points']} points, "
-            f"{data['points_within_range']} of them within {data['max_range_m']:g} m; {data['people']} people",
-        ],
-        ["candidates", ", ".join(f"{count} in {name}" for name, count in result["candidates"].items())],
-        [
-            "rounds",
-            f"{result['rounds']}, everything in turn: {BURST} calls in a row, of which the first is cold",
-        ],
-    ]
-    columns = ["ms", "p50", "p99", "p99/p50", "cold p50", "x copy", "x Open3D", "heads"]
-    rows = [
-        [
-            name, f"{row['p50']:.3f}", f"{row['p99']:.3f}", _number(row["p99_over_p50"], 2), f"{row['cold_p50']:.3f}",
-            _number(row["times_the_copy"], 2), _number(row["times_open3d"], 3), _number(row["heads"], 0),
-        ]
-        for name, row in result["ms"].items()
-    ]  # fmt: skip
-    parts = [table([], head), table(columns, rows)]
-    if result["open3d"] is None:
-        parts.append("Open3D is not installed: its voxel grid was not measured.")
-    parts += [_stage_table(result), _points_table(result["by_points"]), _boxes_table(result["by_box_size"])]
-    parts.append(
-        _memory_table(result["memory"], result["first_result_s"], result["same_heads_with_2_threads"])
-    )
-    return "\n\n".join(parts)
-
-
-def _stage_table(result: Values) -> str:
-    stages = result["stages_ms"]
-    names = list(next(iter(stages.values())))
-    rows = [[stage, *(f"{of[stage]['p50']:.3f}" for of in stages.values())] for stage in names]
-    return table(["ms a stage, p50", *stages], rows)
-
-
-def _points_table(by_points: Values) -> str:
-    rows = [[str(row["points"]), f"{row['p50']:.3f}", f"{row['voxelize']:.3f}"] for row in by_points["rows"]]
-    lines = [
-        f"{name}: {line['fixed_ms']:.3f} ms + {line['ms_a_million_points']:.3f} ms a million points, "
-        f"{line['farthest_from_the_line']:.1%} off at most"
-        for name, line in by_points.items()
-        if name != "rows"
-    ]
-    return "\n".join([table(["points", "detect, ms", "voxelize, ms"], rows), *lines])
-
-
-def _boxes_table(by_size: Values) -> str:
-    rows = [[str(row["voxels"]), f"{row['gate_p50']:.3f}"] for row in by_size["rows"]]
-    text = table(["edge of the boxes, voxels", "gate of 8 boxes, ms"], rows)
-    return f"{text}\nslowest / fastest: {by_size['slowest_over_fastest']:.2f}"
-
-
-def _memory_table(memory: Values, first: Values, same: bool) -> str:
-    growth = memory["resident_growth_bytes"]
-    rows = [
-        ["allocated at a time, a frame", f"{memory['peak_bytes_a_frame']} bytes"],
-        ["the images of a frame", f"{memory['image_bytes']} bytes"],
-        ["kept, a frame", f"{memory['kept_bytes_a_frame']} bytes"],
-        [
-            f"resident memory over {memory['frames']} frames",
-            "not known here" if growth is None else f"{growth:+d} bytes",
-        ],
-        ["the same heads with 2 threads, bit for bit", "yes" if same else "NO"],
-        ["first heads, from the start of Python", f"{first['from_start_of_python']:.2f} s"],
-        ["of that: making a detector", f"{first['make_a_detector']:.2f} s"],
-        ["of that: the first frame", f"{first['first_frame']:.2f} s"],
-    ]
-    return table([], rows)
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
-def _loads(loads: list[float] | None) -> str:
-    return "unknown" if loads is None else " ".join(f"{v:.2f}" for v in loads)
 
 
 # ------------------------------------------------------------------------------------------------- the command

@@ -476,7 +476,9 @@ def best_about(amount: np.ndarray, cells, cascade: Cascade, voxel: float) -> tup
     """Return for each peak the voxel about it that the judge likes best, and its score; no voxel twice."""
     best = {}
     for cell in cells.tolist():
-        about = [tuple(cell[k] + d[k] for k in range(3)) for d in product((-1, 0, 1), repeat=3)]
+        steps = {1: 0, 2: 1, 4: 3}[cascade.spacing]  # to the voxels that were no candidates
+        around = [d for d in product((-1, 0, 1), repeat=3) if sum(map(abs, d)) <= steps]
+        about = [tuple(cell[k] + d[k] for k in range(3)) for d in around]
         scores = [score_by_stages(amount, c, cascade, voxel, judge=True) for c in about]
         if max(scores) > DROPPED:
             best.setdefault(about[scores.index(max(scores))], max(scores))

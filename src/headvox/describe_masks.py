@@ -43,7 +43,7 @@ def _ordinal(number: int) -> str:
 def first_use(cascade: Cascade) -> dict[str, int]:
     """Return for each group that some tree asks for the index of the first stage that does."""
     first: dict[str, int] = {}
-    for s, stage in enumerate(cascade.stages + cascade.judge):
+    for s, stage in enumerate(cascade.every_stage):
         for tree in stage.trees:
             for name, _ in cuts(tree):
                 first.setdefault(name.rpartition(".")[0], s)
@@ -104,7 +104,7 @@ def _votes(votes: Votes) -> str:
 def _groups(cascade: Cascade) -> str:
     first = first_use(cascade)
     counts: dict[str, int] = {}
-    for stage in cascade.stages + cascade.judge:
+    for stage in cascade.every_stage:
         for tree in stage.trees:
             for feature, _ in cuts(tree):
                 name = feature.rpartition(".")[0]
@@ -119,7 +119,7 @@ def _groups(cascade: Cascade) -> str:
                 _placed(group),
                 str(len(group.boxes)),
                 str(counts.get(group.name, 0)),
-                (cascade.stages + cascade.judge)[first[group.name]].name if used else "never",
+                cascade.every_stage[first[group.name]].name if used else "never",
             ]
         )
     heading = f"Groups: {len(cascade.groups)}, of which {len(first)} are asked for"
@@ -140,20 +140,33 @@ def _placed(group: Group) -> str:
 def _stages(cascade: Cascade) -> str:
     first = first_use(cascade)
     rows = []
-    for s, stage in enumerate(cascade.stages + cascade.judge):
+    for s, stage in enumerate(cascade.every_stage):
         new = [group for group in cascade.groups if first.get(group.name) == s]
         look_ups = sum(LOOK_UPS_A_BOX * len(group.boxes) for group in new if group.channel == "occupied")
         cells = sum(_cells(group, cascade.voxel_m) for group in new if group.channel != "occupied")
         keep = f"{stage.keep:g}" if math.isfinite(stage.keep) else ""
         rows.append(
-            [stage.name, str(len(new)), str(look_ups), str(cells), str(len(stage.trees)), _depth(stage), keep]
+            [
+                stage.name,
+                _at(cascade, stage),
+                str(len(new)),
+                str(look_ups),
+                str(cells),
+                str(len(stage.trees)),
+                _depth(stage),
+                keep,
+            ]
         )
-    columns = ["stage", "new groups", "look-ups", "voxels looked at", "trees", "deepest", "keeps from"]
-    trees = sum(len(stage.trees) for stage in cascade.stages + cascade.judge)
+    columns = ["stage", "at", "new groups", "look-ups", "voxels looked at", "trees", "deepest", "keeps from"]
+    trees = sum(len(stage.trees) for stage in cascade.every_stage)
     heading = f"Stage 2, boosted: {trees} trees in {len(rows)} stages"
-    if cascade.judge:
-        heading += f", the last {len(cascade.judge)} at the peaks of the others and about them"
     return f"{heading}\n{table(columns, rows)}"
+
+
+def _at(cascade: Cascade, stage: Stage) -> str:
+    if stage not in cascade.judge:
+        return "candidates"
+    return "both" if stage in cascade.stages else "peaks"
 
 
 def _cells(group: Group, voxel_m: float) -> int:

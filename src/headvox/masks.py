@@ -129,6 +129,11 @@ class Cascade:
     """Stages that score the voxels about the peaks of ``stages`` anew."""
 
     @property
+    def every_stage(self) -> tuple[Stage, ...]:
+        """All stages, those that search and judge both once."""
+        return self.stages + tuple(stage for stage in self.judge if stage not in self.stages)
+
+    @property
     def sees(self) -> bool:
         """Whether some stage asks what the sensors saw to be empty or hidden."""
         used = {
@@ -339,20 +344,20 @@ class _Reader:
             self.tree(value[3], features, where, depth + 1),
         )
 
-    def stage(self, value: object, features: set[str]) -> tuple[Stage, bool]:
-        """Return a stage, and whether it is one of the judge's."""
+    def stage(self, value: object, features: set[str]) -> tuple[Stage, str]:
+        """Return a stage, and where it looks: at "candidates", "peaks" or "both"."""
         table = self.table(value, "stage", {"name", "at", "keep", "trees"})
         name = self.text(table.get("name"), "stage.name")
         at = self.text(table.get("at", "candidates"), f"stage {name}.at")
-        if at not in ("candidates", "peaks"):
-            raise self.error(f"stage {name}.at", '"candidates" or "peaks"', at)
+        if at not in ("candidates", "peaks", "both"):
+            raise self.error(f"stage {name}.at", '"candidates", "peaks" or "both"', at)
         trees = self.items(table.get("trees"), f"stage {name}.trees")
         stage = Stage(
             name,
             self.number(table.get("keep", -math.inf), f"stage {name}.keep", -math.inf, math.inf),
             tuple(self.tree(tree, features, f"stage {name}.trees") for tree in trees),
         )
-        return stage, at == "peaks"
+        return stage, at
 
     def cascade(self, value: dict[str, Any]) -> Cascade:
         known = {"format", "version", "name", "summary", "voxel_m", "subdivision", "occupancy", "gate"}
@@ -385,8 +390,8 @@ class _Reader:
                 "gate", "a condition with min above 0, as only places near points are searched", "none"
             )
         every = [self.stage(entry, features) for entry in self.items(table.get("stage", []), "stage")]
-        stages = tuple(stage for stage, at_peaks in every if not at_peaks)
-        judge = tuple(stage for stage, at_peaks in every if at_peaks)
+        stages = tuple(stage for stage, at in every if at != "peaks")
+        judge = tuple(stage for stage, at in every if at != "candidates")
         if every and not stages:
             raise self.error("stage", 'at least one stage at "candidates"', "none")
         blind = {group.name for group in groups if group.channel == "occupied"}

@@ -44,8 +44,10 @@ I64 = npt.NDArray[np.int64]
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
 SAME_HEAD_M = 0.18
 MOST_PEAKS = 256
-AROUND = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
-"""A voxel and its neighbours."""
+NEIGHBOURS = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
+STEPS = np.abs(NEIGHBOURS).sum(axis=1)
+AROUND = {1: NEIGHBOURS[STEPS == 0], 2: NEIGHBOURS[STEPS <= 1], 4: NEIGHBOURS}
+"""A peak and the voxels about it that were not candidates, when every voxel, every other, every fourth is one."""
 MOST_POSES = 32
 """Heads of a frame that get a pose, best score first."""
 
@@ -262,7 +264,7 @@ class Detector:
         Returned are their cells, their scores, which of the peaks they were, and the threshold, in steps of the score.
         """
         cells, scores, judge = survivors[peaks], scores[peaks], memory.judge
-        sees = self.cascade.source.sees and len(frame.depths) > 0 and not frame.clouds
+        sees = memory.sees and len(frame.depths) > 0 and not frame.clouds
         if judge is not None and len(cells):
             cells, scores, found = self._best_about(S, cells, judge, memory)
             peaks = peaks[found]
@@ -270,7 +272,7 @@ class Detector:
                 scores = self._look_about(frame, S, cells, judge, memory)
         cascade, least = self.cascade.source, self.config.min_score
         if least is None:
-            least = cascade.min_score if sees or not cascade.sees else cascade.min_score_occupied
+            least = cascade.min_score if sees or not memory.sees else cascade.min_score_occupied
         threshold = math.ceil(least * SCORE_UNIT)
         kept = scores >= threshold
         if expected is not None and len(expected):
@@ -282,17 +284,18 @@ class Detector:
         self, S: npt.NDArray[Any], cells: I32, judge: _Stages, memory: _Memory
     ) -> tuple[I32, I64, I64]:
         """Move each peak to the best voxel about it; return cells, scores and which of the peaks they were."""
-        about = (cells[:, None] + AROUND).reshape(-1, 3)
+        around = AROUND[self.cascade.gate.spacing]
+        about = (cells[:, None] + around).reshape(-1, 3)
         memory.make_room(len(about))
         scores = np.empty(len(about), np.int64)
         self._score(S, about, memory.unseen, judge, memory, scores)
-        best = np.arange(len(cells)) * len(AROUND) + scores.reshape(len(cells), -1).argmax(axis=1)
+        best = np.arange(len(cells)) * len(around) + scores.reshape(len(cells), -1).argmax(axis=1)
         best = best[scores[best] > DROPPED]
         _, ny, nz = S.shape
         place = (about[best, 0].astype(np.int64) * ny + about[best, 1]) * nz + about[best, 2]
         _, first = np.unique(place, return_index=True)  # neighbours may meet at the same voxel
         best = best[np.sort(first)]
-        return about[best], scores[best], best // len(AROUND)
+        return about[best], scores[best], best // len(around)
 
     def _look_about(
         self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: _Stages, memory: _Memory
@@ -448,6 +451,7 @@ class _Memory:
         self.survivors = np.empty((4096, 3), np.int32)
         self.points = np.empty((MOST_PARTS, 3))
         self.unseen = np.zeros((1, 1, 2), np.int32)
+        self.sees = cascade.source.sees
         self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
         self.judge = _Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
         self.scratch = [Scratch() for _ in range(threads if detector.config.refine == "pose" else 0)]

@@ -225,7 +225,7 @@ def _group_picture(n: int, group: Group, influence: Influence) -> Picture:
 def influence_of_features(cascade: Cascade) -> dict[str, Influence]:
     """Return the influence of each feature that some tree asks for."""
     found: dict[str, Influence] = {}
-    for stage in cascade.stages + cascade.judge:
+    for stage in cascade.every_stage:
         for tree in stage.trees:
             for feature, change in _changes(tree):
                 old = found.get(feature, Influence(0, 0.0, 0.0))

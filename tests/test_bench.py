@@ -19,7 +19,7 @@ CASES = ["detect, cloud", "detect_depth", "detect_depth, 2 threads", "detect, sh
 
 @pytest.fixture(scope="module")
 def result() -> dict[str, object]:
-    return bench.measure("default", rounds=3, frames=5, small=True, note=lambda text: None)
+    return bench.measure("default", "sphere", rounds=3, frames=5, small=True, note=lambda text: None)
 
 
 def test_it_measures_all_that_it_promises(result):

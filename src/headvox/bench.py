@@ -18,7 +18,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +85,7 @@ images = [
     for k, (size, lens) in enumerate(zip(data["sizes"].tolist(), data["lenses"].tolist()))
 ]
 read = time.perf_counter()
-detector = headvox.Detector(DetectorConfig(cascade=sys.argv[2], max_range_m=3.5))
+detector = headvox.Detector(DetectorConfig(cascade=sys.argv[2], refine=sys.argv[3], max_range_m=3.5))
 ready = time.perf_counter()
 detector.detect_depth(images)
 print(ready - read, time.perf_counter() - ready, time.perf_counter() - begun)
@@ -148,15 +148,17 @@ def _percentiles(ms: Iterable[float]) -> Values:
 # ------------------------------------------------------------------------------------------------ the sections
 
 
-def measure(cascade: str, rounds: int, frames: int, small: bool, note: Callable[[str], None]) -> Values:
+def measure(
+    cascade: str, refine: str, rounds: int, frames: int, small: bool, note: Callable[[str], None]
+) -> Values:
     """Measure everything and return it, ready for JSON; ``note`` is told what is going on.
 
     Raises:
         HeadvoxError: no such cascade.
     """
-    config = DetectorConfig(cascade=cascade, max_range_m=MAX_RANGE_M, centre=CENTRE)
-    alone = DetectorConfig(cascade=cascade, max_range_m=MAX_RANGE_M)
-    two = DetectorConfig(cascade=cascade, max_range_m=MAX_RANGE_M, centre=CENTRE, threads=2)
+    alone = DetectorConfig(cascade=cascade, refine=refine, max_range_m=MAX_RANGE_M)
+    config = replace(alone, centre=CENTRE)
+    two = replace(config, threads=2)
     note("compiling, where that was not done before")
     for one in (config, two):
         warm_up(one)
@@ -187,7 +189,7 @@ def measure(cascade: str, rounds: int, frames: int, small: bool, note: Callable[
         found = {name: len(call()) for name, (_, call) in calls.items()}
         same = _same(depth.detect_depth(data.images), depth_2.detect_depth(data.images))
     note("starting fresh processes")
-    first = _first_result(data, cascade, 1 if small else 5)
+    first = _first_result(data, cascade, refine, 1 if small else 5)
     machine["load_average_after"] = load_average()
     copy, grid = (
         next((case.ms for case in cases if case.name == name and case.ms), None) for name in (COPY, OPEN3D)
@@ -195,6 +197,7 @@ def measure(cascade: str, rounds: int, frames: int, small: bool, note: Callable[
     return {
         "headvox": __version__,
         "cascade": cascade,
+        "refine": refine,
         "machine": machine,
         "input": {
             "cameras": [f"{image.intrinsics.width}x{image.intrinsics.height}" for image in data.images],
@@ -328,7 +331,7 @@ def _resident_bytes() -> int | None:
         return None
 
 
-def _first_result(data: Input, cascade: str, times: int) -> Values:
+def _first_result(data: Input, cascade: str, refine: str, times: int) -> Values:
     """Start a fresh Python, and let it find the heads in one frame, from the loops that are kept on the disk."""
     arrays: dict[str, Any] = {}
     for k, image in enumerate(data.images):
@@ -343,7 +346,10 @@ def _first_result(data: Input, cascade: str, times: int) -> Values:
         for _ in range(times):
             begun = time.perf_counter()
             done = subprocess.run(
-                [sys.executable, "-c", FIRST, str(file), cascade], capture_output=True, text=True, check=False
+                [sys.executable, "-c", FIRST, str(file), cascade, refine],
+                capture_output=True,
+                text=True,
+                check=False,
             )
             wall = time.perf_counter() - begun
             if done.returncode:
@@ -384,6 +390,12 @@ def main(argv: list[str]) -> int:
         allow_abbrev=False,
     )
     parser.add_argument("--cascade", default="default", metavar="NAME|FILE", help="which masks (default)")
+    parser.add_argument(
+        "--refine",
+        choices=("pose", "sphere", "none"),
+        default="pose",
+        help="how a head's centre is found (pose)",
+    )
     parser.add_argument("--rounds", type=whole_number, metavar="N", help="rounds of calls (100)")
     parser.add_argument(
         "--quick", action="store_true", help="a few rounds on small images: only to see it work"
@@ -399,6 +411,6 @@ def main(argv: list[str]) -> int:
     def note(text: str) -> None:
         print(f"headvox bench: {text}", file=sys.stderr, flush=True)
 
-    result = measure(args.cascade, rounds, frames, args.quick, note)
+    result = measure(args.cascade, args.refine, rounds, frames, args.quick, note)
     print(json.dumps(result, indent=1) if args.json else report(result))
     return 0

@@ -22,6 +22,7 @@ def report(result: Values) -> str:
             f"{_loads(machine['load_average'])} before, {_loads(machine['load_average_after'])} after",
         ],
         ["cascade", result["cascade"]],
+        ["refine", result["refine"]],
         [
             "input",
             f"{len(data['cameras'])} depth images of {data['cameras'][0]}, {data['points']} points, "

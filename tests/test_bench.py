@@ -81,12 +81,12 @@ def test_the_input_is_the_same_every_time():
 
 def test_the_command_prints_one_json_object(capsys, monkeypatch, result):
     asked = []
-    monkeypatch.setattr(bench, "measure", lambda *args: asked.append(args[:4]) or result)
+    monkeypatch.setattr(bench, "measure", lambda *args: asked.append(args[:5]) or result)
     assert cli.main(["bench", "--quick", "--json", "--cascade", "paper"]) == 0
     assert json.loads(capsys.readouterr().out) == result
     assert cli.main(["bench", "--rounds", "7"]) == 0
     assert "load average" in capsys.readouterr().out
-    assert asked == [("paper", 5, 20, True), ("default", 7, 1000, False)]
+    assert asked == [("paper", "pose", 5, 20, True), ("default", "pose", 7, 1000, False)]
 
 
 def test_wrong_usage_and_unknown_cascades_are_told(capsys):

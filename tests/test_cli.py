@@ -566,6 +566,7 @@ def test_a_trajectory_a_track(recording: Path, anything: Path, tmp_path: Path) -
     for head in confirmed:
         rows = np.loadtxt(tmp_path / f"out_{head['id']}.tum", ndmin=2)
         np.testing.assert_allclose(rows[-1, :4], [0.2, *head["centre"]], atol=1e-9)
-        assert np.isnan(rows[-1, 4:]).all()
+        wanted = [np.nan] * 4 if head["quaternion"] is None else head["quaternion"]
+        np.testing.assert_allclose(rows[-1, 4:], wanted, atol=1e-6)
     assert_explained(headvox("run", recording, "--no-track", "-o", tmp_path / "out.tum"), 2)
     assert_explained(headvox("run", recording, "-o", tmp_path / "nowhere" / "out.tum"))

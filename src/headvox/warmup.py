@@ -10,7 +10,7 @@ import numpy as np
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
-from headvox.masks import CompiledCascade, load_cascade
+from headvox.masks import CompiledCascade, CompiledStages, load_cascade
 from headvox.pipeline import Detector
 from headvox.track import Tracker
 
@@ -31,10 +31,8 @@ def warm_up(config: DetectorConfig) -> None:
     points = np.stack(np.meshgrid(grid, grid, grid), axis=-1).reshape(-1, 3).astype(np.float32)
     wall = np.full((12, 16), 3, np.uint16)
     camera = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0, depth_scale=voxel)
-    for writeable in (
-        True,
-        False,
-    ):  # Numba compiles a loop anew for arrays that lie in somebody else's buffer
+    # Numba compiles a loop anew for arrays that lie in somebody else's buffer.
+    for writeable in (True, False):
         points.flags.writeable = wall.flags.writeable = writeable
         detector.detect_frame(Frame(0, clouds=(Cloud("warm-up", points),)))
         frame = Frame(0, depths=(DepthImage("warm-up", wall, camera, np.eye(4)),))
@@ -58,10 +56,15 @@ def cache_folder() -> Path:
 
 def _open(cascade: CompiledCascade) -> CompiledCascade:
     """Return ``cascade`` with all its doors open, so that each loop is run whatever the masks ask for."""
-    gate, votes, stages = cascade.gate, cascade.votes, cascade.stages
+    gate, votes = cascade.gate, cascade.votes
+
+    def opened(stages: CompiledStages | None) -> CompiledStages | None:
+        return replace(stages, stage_keep=np.full_like(stages.stage_keep, -_ANYTHING)) if stages else None
+
     return replace(
         cascade,
         gate=replace(gate, low=np.full_like(gate.low, -_ANYTHING), high=np.full_like(gate.high, _ANYTHING)),
         votes=replace(votes, min_votes=0) if votes else None,
-        stages=replace(stages, stage_keep=np.full_like(stages.stage_keep, -_ANYTHING)) if stages else None,
+        stages=opened(cascade.stages),
+        judge=opened(cascade.judge),
     )

@@ -374,7 +374,7 @@ def set_parameter(robot: Robot, name: str, value):
         ("detector.voxel_m", 1.0, "range"),
         ("detector.voxel_m", "coarse", "detector.voxel_m"),
         ("detector.cascade", "nobody", "nobody"),
-        ("detector.refine", "magic", 'expected "sphere" or "none"'),
+        ("detector.refine", "magic", 'expected "pose", "sphere" or "none"'),
         ("detector.centre", [1.0, 2.0], "three numbers"),
         ("detector.threads", 65, "range"),
         ("detector.max_height_m", -3.0, "above min_height_m"),

@@ -19,6 +19,7 @@ from headvox.evolve.write import Found, cascade_text, write_cascade
 from headvox.frames import inverse, transform
 from headvox.gate import pass_gate
 from headvox.masks import compile_cascade, load_cascade, parse_cascade
+from headvox.synth.scene import TrueHead
 from headvox.vote import DROPPED, score_by_stages
 
 SMALL_SEARCH = (
@@ -312,3 +313,16 @@ def test_bad_commands_end_before_any_work(tmp_path, monkeypatch, capsys):
     assert "exists already" in capsys.readouterr().err
     assert (tmp_path / "evolved.toml").read_text() == "mine"
     assert main(["masks", "evolve", "--seed", "-1"]) == 2
+
+
+def test_a_camera_whose_image_is_cut_off_before_a_head_does_not_see_it() -> None:
+    camera = Intrinsics(4, 4, 4.0, 4.0, 1.5, 1.5, 0.001)
+    images = [DepthImage(name, np.full((4, 4), 3000, np.uint16), camera, np.eye(4)) for name in ("near", "far")]
+    seen_by, upright = {"near": 0.9, "far": 0.5}, np.array([0.0, 0.0, 0.0, 1.0])
+    truth = [
+        TrueHead(k, np.array([0.0, 0.0, z]), upright, "standing", seen_by, False, False)
+        for k, z in enumerate((2.0, 3.0, 4.5))
+    ]
+    heads = views._heads_of(truth, images, {"near": 2.5, "far": 4.0})
+    assert heads.visible.tolist() == [0.9, 0.5, 0.0]
+    assert heads.clear.tolist() == [True, True, False]

@@ -20,7 +20,7 @@ from numpy.lib import format as npy
 from scipy.spatial.transform import Rotation
 
 from headvox.data import F64, Cloud, DepthImage, Frame, Intrinsics
-from headvox.frames import transform
+from headvox.frames import inverse, transform
 from headvox.mesh import sample_surface
 from headvox.synth.heads import make_shell, sample_identities
 from headvox.synth.people import pose_person, sample_person, sample_pose
@@ -82,15 +82,23 @@ def make_view(seed: int, number: int) -> View:
         frame, truth = sample_scene(rng, None, postures, moving=False).frame(0)
     if len(frame.depths) > 1 and rng.uniform() < 0.7:
         frame = replace(frame, depths=tuple(_misplaced(image, rng) for image in frame.depths))
+    far_m = {image.name: np.inf for image in frame.depths}
     if rng.uniform() < CUT_SHARE:
-        frame = replace(
-            frame, depths=tuple(_cut(image, float(rng.uniform(1.5, 4.0))) for image in frame.depths)
-        )
-    return View(number, frame, _heads_of(truth))
+        far_m = {image.name: float(rng.uniform(1.5, 4.0)) for image in frame.depths}
+    heads = _heads_of(truth, frame.depths, far_m)
+    return View(
+        number, replace(frame, depths=tuple(_cut(image, far_m[image.name]) for image in frame.depths)), heads
+    )
 
 
-def _heads_of(truth: Sequence[TrueHead]) -> Heads:
-    visible = np.array([max(head.visible.values(), default=0.0) for head in truth])
+def _heads_of(truth: Sequence[TrueHead], images: Sequence[DepthImage], far_m: dict[str, float]) -> Heads:
+    """Return the heads; a camera whose image is cut off before a head does not see it."""
+    visible = np.zeros(len(truth))
+    for image in images:
+        T = inverse(image.T_world_camera)
+        for k, head in enumerate(truth):
+            if transform(T, head.centre[None])[0, 2] < far_m[image.name]:
+                visible[k] = max(visible[k], head.visible.get(image.name, 0.0))
     clear = [
         seen >= LEAST_VISIBLE and not head.ignore and not head.truncated
         for seen, head in zip(visible, truth, strict=True)

@@ -317,7 +317,9 @@ def test_bad_commands_end_before_any_work(tmp_path, monkeypatch, capsys):
 
 def test_a_camera_whose_image_is_cut_off_before_a_head_does_not_see_it() -> None:
     camera = Intrinsics(4, 4, 4.0, 4.0, 1.5, 1.5, 0.001)
-    images = [DepthImage(name, np.full((4, 4), 3000, np.uint16), camera, np.eye(4)) for name in ("near", "far")]
+    images = [
+        DepthImage(name, np.full((4, 4), 3000, np.uint16), camera, np.eye(4)) for name in ("near", "far")
+    ]
     seen_by, upright = {"near": 0.9, "far": 0.5}, np.array([0.0, 0.0, 0.0, 1.0])
     truth = [
         TrueHead(k, np.array([0.0, 0.0, z]), upright, "standing", seen_by, False, False)

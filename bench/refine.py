@@ -18,10 +18,11 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from headvox.align import Scratch
 from headvox.data import Cloud, Expected, Frame
 from headvox.errors import HeadvoxError
 from headvox.kernels import Threads
-from headvox.pose import Scratch, fit_poses
+from headvox.pose import fit_poses
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.processes import in_processes
@@ -79,7 +80,7 @@ def measure(frame: Frame, centre: np.ndarray, R: Rotation, rng: np.random.Genera
     """Fit from 3 to 5 cm off, then from the orientation that a track would expect."""
     off = rng.normal(size=3)
     start = (centre + rng.uniform(0.03, 0.05) * off / np.linalg.norm(off))[None]
-    scratch, threads = [Scratch()], Threads(1)
+    scratch, threads = [Scratch.new()], Threads(1)
     fit_poses(frame, start, scratch, threads)
     began = time.thread_time()
     poses = fit_poses(frame, start, scratch, threads)

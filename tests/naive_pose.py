@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from headvox import align, nearby
+from headvox import settle as settling
 from headvox.data import Frame
 
 
@@ -136,3 +138,24 @@ def align_one(samples, rays, turn, upright, template):
         state = move(state, -np.linalg.solve(A, b))
     cost, A, _, told = linearise(samples, rays, most, modes, align.LAST_K, upright, template, state)
     return state, [*told, cost + 0.5 * np.linalg.slogdet(A)[1]], np.linalg.inv(A)[:6, :6]
+
+
+def settle(work, count, best, centre, template):
+    """What is stated of a mixture of states: centre, radius, its covariance, quaternion and its covariance."""
+    states, evidence = work.fine[:count], work.told[:count, align.EVIDENCE]
+    R = states[best, 3:12].reshape(3, 3)
+    odds = np.nan_to_num(np.exp((evidence[best] - evidence) / template.temperature))
+    odds /= odds.sum()
+    turns = Rotation.from_matrix(R.T @ states[:, 3:12].reshape(-1, 3, 3)).as_rotvec()
+    shifts = states[:, :3] - states[best, :3]
+    own = work.covariances[best]
+    centre_covariance = template.shift_factor * R @ own[:3, :3] @ R.T
+    turn_covariance = template.turn_factor * own[3:, 3:]
+    for share, turn, shift in zip(odds, turns, shifts, strict=True):
+        centre_covariance = centre_covariance + share * np.outer(shift, shift)
+        turn_covariance = turn_covariance + share * np.outer(turn, turn)
+    quaternion = Rotation.from_matrix(R).as_quat()
+    if turn_covariance[2, 2] >= settling.SURE_YAW_RAD**2:
+        quaternion, turn_covariance = np.full(4, np.nan), np.full((3, 3), np.nan)
+    radius = template.radius_m * np.exp(states[best, 12])
+    return centre + states[best, :3], radius, centre_covariance, quaternion, turn_covariance

@@ -4,10 +4,11 @@ import pytest
 import scenes
 from scipy.spatial.transform import Rotation
 
-from headvox import Cloud, DepthImage, Frame, Intrinsics, align, nearby
+from headvox import Cloud, DepthImage, Frame, Intrinsics, align, nearby, settle
+from headvox.align import Scratch
 from headvox.data import Expected
 from headvox.kernels import Threads
-from headvox.pose import Scratch, all_turns, expected_turns, fit_poses, upright_turns
+from headvox.pose import Poses, all_turns, expected_turns, fit_poses, upright_turns
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
@@ -38,14 +39,14 @@ def gathered(frame, centre):
         np.zeros((nearby.MOST_SAMPLES, nearby.SAMPLE)),
         np.zeros((nearby.MOST_SAMPLES, nearby.RAY)),
     )
-    n, m = nearby.gather(frame, np.asarray(centre, dtype=np.float64), samples, rays)
+    n, m = nearby.gather(nearby.sensors_of(frame), np.asarray(centre, dtype=np.float64), samples, rays)
     return samples[:n], rays[:m]
 
 
 def fitted(frame, centres, expected=None, threads=1):
     pool = Threads(threads)
     try:
-        scratch = [Scratch() for _ in range(threads)]
+        scratch = [Scratch.new() for _ in range(threads)]
         return fit_poses(frame, np.asarray(centres, dtype=np.float64).reshape(-1, 3), scratch, pool, expected)
     finally:
         pool.close()
@@ -96,35 +97,82 @@ def test_normal_equations_equal_the_naive_twin(seed, modes):
     rng = np.random.default_rng(seed)
     samples, rays = gathered(Frame(0, depths=(bumpy_image(rng),)), np.zeros(3))
     state, upright = random_state(rng), seed % 2 == 0
-    A, J, told = np.empty((17, 18)), np.empty(18), np.zeros(align.TOLD)
-    most = np.array([150, 90])
-    cost = align.linearise(
-        samples, len(samples), rays, len(rays), most, modes, 4.0, upright,
-        TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m, state, A, J, told,
-    )  # fmt: skip
-    wanted = naive_pose.linearise(samples, rays, most, modes, 4.0, upright, TEMPLATE, state)
+    points, passing = samples[naive_pose.even(len(samples), 150)], rays[naive_pose.even(len(rays), 90)]
+    work, told = Scratch.new(), np.zeros(align.TOLD)
+    work.J[:] = np.nan  # what an earlier fit may have left
+    place = (TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m, state, work.J, work.A, told)
+    cost = align.linearise(points, len(points), passing, len(passing), modes, 4.0, upright, True, *place)
+    A = work.A.copy()
+    wanted = naive_pose.linearise(samples, rays, (150, 90), modes, 4.0, upright, TEMPLATE, state)
     size = 7 + modes
     np.testing.assert_allclose(cost, wanted[0], rtol=1e-9)
     np.testing.assert_allclose(np.triu(A[:size, :size]), np.triu(wanted[1]), rtol=1e-6, atol=1e-3)
     np.testing.assert_allclose(A[:size, align.RESIDUAL], wanted[2], rtol=1e-6, atol=1e-4)
     np.testing.assert_allclose(told[:3], wanted[3], rtol=1e-9)
     assert told[align.CROSSED] > 0
+    work.A[:] = 0.0
+    alone = align.linearise(points, len(points), passing, len(passing), modes, 4.0, upright, False, *place)
+    assert alone == cost
+    assert not work.A.any()
 
 
 def test_one_start_equals_the_naive_twin(views):
     for view, start in views[:2]:
         samples, rays = gathered(view.frame, start)
         turn = Rotation.from_quat(view.head.quaternion).as_matrix().reshape(1, 9)
-        scratch = Scratch()
-        count = align.align(
-            samples, len(samples), rays, len(rays), turn, True, TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m,
-            scratch.coarse, scratch.fine, scratch.told, scratch.covariances,
-        )  # fmt: skip
+        scratch = Scratch.new()
+        scratch.samples[: len(samples)], scratch.rays[: len(rays)] = samples, rays
+        count = align.align(scratch, len(samples), len(rays), turn, True, TEMPLATE)
         state, told, covariance = naive_pose.align_one(samples, rays, turn[0], True, TEMPLATE)
         assert count == 1
         np.testing.assert_allclose(scratch.fine[0], state, atol=1e-6)
         np.testing.assert_allclose(scratch.told[0], told, rtol=1e-6)
         np.testing.assert_allclose(scratch.covariances[0], covariance, rtol=1e-4, atol=1e-12)
+
+
+def scattered(rng, count):
+    """What a fit may come to: states about one another, what they cost, and covariances."""
+    work = Scratch.new()
+    for s in range(count):
+        work.fine[s] = random_state(rng)
+        if s and rng.random() < 0.5:  # half a turn away: where rotation vectors jump
+            half = Rotation.from_rotvec(np.pi * np.eye(3)[rng.integers(3)]).as_matrix()
+            work.fine[s, 3:12] = (work.fine[0, 3:12].reshape(3, 3) @ half).reshape(9)
+        root = rng.normal(0, 0.02, (6, 6))
+        work.covariances[s] = root @ root.T
+    work.told[:, align.EVIDENCE] = rng.normal(0, 10, len(work.told))
+    return work
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_settling_equals_the_naive_twin(seed):
+    rng = np.random.default_rng(seed)
+    count = 1 + seed % align.MOST_REFINED
+    work, centre, poses = scattered(rng, count), rng.normal(size=3), Poses.unknown(np.zeros((2, 3)))
+    best = int(np.argmin(work.told[:count, align.EVIDENCE]))
+    if seed % 4 == 3:
+        work.told[(best + 1) % count, align.EVIDENCE] = (
+            np.nan if count > 1 else work.told[best, align.EVIDENCE]
+        )
+    settle.settle(work, count, best, centre, TEMPLATE, poses, 1)
+    wanted = naive_pose.settle(work, count, best, centre, TEMPLATE)
+    got = (poses.centres[1], poses.radii[1], poses.centre_covariances[1], poses.quaternions[1])
+    for one, other in zip((*got, poses.rotation_covariances[1]), wanted, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    assert np.isnan(poses.radii[0])
+
+
+def test_turns_between_states_equal_scipys():
+    rng = np.random.default_rng(0)
+    turns = [np.zeros(3), 1e-12 * np.ones(3), *rng.normal(0, 2, (40, 3)), *((np.pi - 1e-7) * np.eye(3))]
+    for turn in turns:
+        one, other = random_state(rng), random_state(rng)
+        R = one[3:12].reshape(3, 3)
+        other[3:12] = (R @ Rotation.from_rotvec(turn).as_matrix()).reshape(9)
+        wanted = Rotation.from_rotvec(turn).as_rotvec()
+        np.testing.assert_allclose(settle.turn_between(one, other), wanted, atol=1e-7)
+        q = settle.quaternion_of(*other[3:12])
+        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix().reshape(9), other[3:12], atol=1e-12)
 
 
 # -------------------------------------------------------------------------------------------------------- the truth
@@ -241,7 +289,7 @@ def test_a_huge_image_and_a_dense_cloud_do_not_overrun_the_memory():
 def test_more_sensors_than_room():
     image = bumpy_image(np.random.default_rng(0))
     samples, rays = np.zeros((50, nearby.SAMPLE)), np.zeros((50, nearby.RAY))
-    n, m = nearby.gather(Frame(0, depths=(image,) * 120), np.zeros(3), samples, rays)
+    n, m = nearby.gather(nearby.sensors_of(Frame(0, depths=(image,) * 120)), np.zeros(3), samples, rays)
     assert 0 < n <= 50
     assert m <= 50
 

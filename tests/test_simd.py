@@ -35,6 +35,7 @@ from headvox.simd import (
     times,
     to_float,
     to_int,
+    total,
     where,
     widen,
     within,
@@ -92,6 +93,11 @@ def reals(xyz, out, cut):
 @bare_kernel
 def converted(a, out):
     store(out, 0, to_float(load(a, 0)))
+
+
+@bare_kernel
+def summed(a, at):
+    return total(load(a, at))
 
 
 @bare_kernel
@@ -169,6 +175,14 @@ def test_unsigned_numbers_become_floats():
     out = np.zeros(LANES, np.float32)
     converted(a, out)
     np.testing.assert_array_equal(out, a)
+
+
+def test_the_total_is_that_of_halves_of_halves():
+    a = np.random.default_rng(7).normal(size=40) * 10.0 ** np.arange(-20, 20)
+    halves = a[3 : 3 + LANES]
+    while len(halves) > 1:
+        halves = halves[: len(halves) // 2] + halves[len(halves) // 2 :]
+    assert summed(a, 3) == halves[0]
 
 
 def test_lowest_bit():

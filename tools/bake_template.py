@@ -26,16 +26,19 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from headvox.align import EVIDENCE
+from headvox.align import EVIDENCE, Scratch
 from headvox.data import Intrinsics
 from headvox.frames import inverse, transform
 from headvox.kernels import kernel
-from headvox.pose import Poses, Scratch, fit_pose
+from headvox.nearby import gather, sensors_of
+from headvox.pose import Poses, all_turns, upright_turns
+from headvox.settle import fit_head
 from headvox.synth.people import PosedBody, pose_person, sample_person, sample_pose
 from headvox.synth.people import _rest as rest
 from headvox.synth.portraits import portrait
 from headvox.synth.processes import in_processes
 from headvox.synth.rays import Mesh, look
+from headvox.template import load_template
 
 TRAINING = 0x7E3A1
 POSTURES = ("standing", "walking", "sitting", "bending", "crouching", "lying")
@@ -178,8 +181,10 @@ def odds_and_errors(number: int) -> tuple[np.ndarray, ...] | None:
     view = portrait((TRAINING, 2, number), float(distance), float(bearing), int(cameras))
     off = rng.normal(size=3)
     start = view.head.centre + rng.uniform(0.02, 0.05) * off / np.linalg.norm(off)
-    scratch, poses = Scratch(), Poses.unknown(start[None])
-    best, count = fit_pose(view.frame, start, np.full(9, np.nan), scratch, poses, 0)
+    scratch, poses = Scratch.new(), Poses.unknown(start[None])
+    n, m = gather(sensors_of(view.frame), start, scratch.samples, scratch.rays)
+    starts, nothing = (upright_turns(), all_turns()), np.full(9, np.nan)
+    best, count = fit_head(scratch, n, m, start, nothing, *starts, load_template(), poses, 0)
     if count == 0:
         return None
     R = scratch.fine[:count, 3:12].reshape(-1, 3, 3)

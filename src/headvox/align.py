@@ -10,13 +10,22 @@ the template's own spread and the sensor's noise along and across its ray.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from headvox.kernels import bare_kernel, kernel, rule
+from headvox.data import F64
+from headvox.kernels import bare_kernel, rule
+from headvox.nearby import MOST_SAMPLES, RAY, SAMPLE
+from headvox.simd import LANES, add, load, mul, store, total
 from headvox.template import MODES
 
 PARAMETERS = 7 + MODES  # a shift and a turn in the head's axes, log scale, modes
-RESIDUAL = PARAMETERS  # where a row of the Jacobian has the residual
+RESIDUAL = PARAMETERS  # the row of the Jacobian, and the column of A, that belongs to the residual
+WEIGHT, WEIGHTED = (
+    RESIDUAL + 1,
+    RESIDUAL + 2,
+)  # further rows of the Jacobian: the weights, and room for a product
 STATE = 13 + MODES  # centre (3), rotation (9) row by row, log scale, modes
 COST, ON_SURFACE, CROSSED, EVIDENCE = 0, 1, 2, 3  # what is told of a fit
 TOLD = 4
@@ -29,6 +38,8 @@ COARSE_K, FINE_K, LAST_K = (
     4.0,
     2.5,
 )  # of the first coarse step (1 less each step), the first and last fine one
+ROOM = 392  # a row of the Jacobian: all points and rays in whole vectors, and 64 bytes off the caches' 4 KB alias
+MOST_STARTS = 60
 MOST_REFINED = 6
 MARGIN = 40.0  # a start that costs more than the best one by this is not refined, but for the second best
 ALIKE = 2.88  # trace of the turn between two starts that are one: 20 degrees apart
@@ -44,23 +55,96 @@ LONGEST_STEP_M, LARGEST_TURN_RAD = 0.03, 0.5
 LARGEST_LOG_SCALE = 0.35
 
 
+class Scratch(NamedTuple):
+    """The working memory of one thread: what a fit reads, what it needs, and what it comes to."""
+
+    samples: F64
+    """(MOST_SAMPLES, SAMPLE) what was gathered about the candidate (:mod:`headvox.nearby`), and"""
+    rays: F64
+    """(MOST_SAMPLES, RAY)"""
+    points: F64
+    """(FINE_SAMPLES, SAMPLE) those of the samples that are used, and"""
+    passing: F64
+    """(FINE_RAYS, RAY) of the rays"""
+    J: F64
+    """(PARAMETERS + 3, ROOM) the Jacobian, a column a point; residuals, weights and scrap"""
+    A: F64
+    """(PARAMETERS, PARAMETERS + 1) the normal equations"""
+    x: F64
+    """(PARAMETERS,) a step"""
+    costs: F64
+    """(MOST_STARTS,) of the starts"""
+    coarse: F64
+    """(MOST_STARTS, STATE) what the starts came to"""
+    fine: F64
+    """(MOST_REFINED, STATE) the refined states"""
+    told: F64
+    """(MOST_REFINED + 1, TOLD) of the refined states; the last row is scrap"""
+    covariances: F64
+    """(MOST_REFINED, 6, 6) of shift and turn, in the head's axes"""
+
+    @classmethod
+    def new(cls) -> Scratch:
+        """Return the memory for one thread, all zeros."""
+        return cls(
+            np.zeros((MOST_SAMPLES, SAMPLE)), np.zeros((MOST_SAMPLES, RAY)), np.zeros((FINE_SAMPLES, SAMPLE)),
+            np.zeros((FINE_RAYS, RAY)), np.zeros((PARAMETERS + 3, ROOM)), np.zeros((PARAMETERS, PARAMETERS + 1)),
+            np.zeros(PARAMETERS), np.zeros(MOST_STARTS), np.zeros((MOST_STARTS, STATE)),
+            np.zeros((MOST_REFINED, STATE)), np.zeros((MOST_REFINED + 1, TOLD)), np.zeros((MOST_REFINED, 6, 6)),
+        )  # fmt: skip
+
+
 @rule
-def _add(A, J, w, size):  # type: ignore[no-untyped-def]
-    """Add w J Jᵀ to the upper half of A, and w J e to its column RESIDUAL."""
+def choose(source, there, target, most):  # type: ignore[no-untyped-def]
+    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many."""
+    used = min(there, most)
+    for s in range(used):
+        at = (2 * s + 1) * there // (2 * used)
+        for j in range(source.shape[1]):
+            target[s, j] = source[at, j]
+    return used
+
+
+@rule
+def _accumulate(J, count, size, A):  # type: ignore[no-untyped-def]
+    """Set the upper half of A to J W Jᵀ over ``count`` columns, whole vectors, and its last column to J W e.
+
+    Many columns are summed side by side, always in the same order, whatever the processor's vectors hold.
+    """
+    flat = J.reshape(-1)
     for i in range(size):
-        a = w * J[i]
-        for j in range(i, size):
-            A[i, j] += a * J[j]
-        A[i, RESIDUAL] += a * J[RESIDUAL]
+        for at in range(0, count, LANES):
+            weighted = mul(load(flat, i * ROOM + at), load(flat, WEIGHT * ROOM + at))
+            store(flat, WEIGHTED * ROOM + at, weighted)
+        for j in range(i, size + 1):
+            column = j if j < size else RESIDUAL
+            sums = mul(load(flat, WEIGHTED * ROOM), load(flat, column * ROOM))
+            for at in range(LANES, count, LANES):
+                sums = add(sums, mul(load(flat, WEIGHTED * ROOM + at), load(flat, column * ROOM + at)))
+            A[i, column] = total(sums)
+
+
+@rule
+def _add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
+    """Add to A what one more row with the residual ``e`` says, which knows of the turn alone."""
+    A[3, 3] += weight * wx * wx
+    A[3, 4] += weight * wx * wy
+    A[3, 5] += weight * wx * wz
+    A[4, 4] += weight * wy * wy
+    A[4, 5] += weight * wy * wz
+    A[5, 5] += weight * wz * wz
+    A[3, RESIDUAL] += weight * wx * e
+    A[4, RESIDUAL] += weight * wy * e
+    A[5, RESIDUAL] += weight * wz * e
 
 
 @bare_kernel
-def linearise(samples, n, rays, m, most, modes, k, upright, rows, low, voxel_m, state, A, J, told):  # type: ignore[no-untyped-def]
-    """Return the cost of ``state``; write the normal equations to ``A`` (PARAMETERS, PARAMETERS + 1).
+def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, state, J, A, told):  # type: ignore[no-untyped-def]
+    """Return the cost of ``state``; write the normal equations to ``A`` (PARAMETERS, PARAMETERS + 1), if it ``steps``.
 
-    Of the ``n`` samples and ``m`` rays at most ``most`` (2,) are used, evenly over all. ``modes`` are fitted,
-    ``k`` is the scale of rho, ``upright`` says whether the priors on pitch and roll hold. ``J`` is scrap; ``told``
-    receives the samples' share of the cost, how many lie on the surface, and how many rays cross it.
+    The first ``n`` points and ``m`` rays count. ``modes`` are fitted, ``k`` is the scale of rho, ``upright`` says
+    whether the priors on pitch and roll hold. ``J`` is scrap; ``told`` receives the points' share of the cost, how
+    many lie on the surface, and how many rays cross it.
     """
     cx, cy, cz = state[0], state[1], state[2]
     r00, r01, r02 = state[3], state[4], state[5]
@@ -68,111 +152,115 @@ def linearise(samples, n, rays, m, most, modes, k, upright, rows, low, voxel_m, 
     r20, r21, r22 = state[9], state[10], state[11]
     scale = np.exp(state[12])
     shrink = 1.0 / (scale * voxel_m)
+    metres = scale * voxel_m
     lx, ly, lz = low[0] / voxel_m, low[1] / voxel_m, low[2] / voxel_m
     nx, ny, nz = rows.shape[0], rows.shape[1], rows.shape[2]
     size = 7 + modes
-    for i in range(size):
-        for j in range(PARAMETERS + 1):
-            A[i, j] = 0.0
     k2 = k * k
     cost = 0.0
-    on = 0
-    crossed = 0
-    for kind in range(2):
-        is_point = kind == 0
-        there = n if is_point else m
-        used = min(there, most[kind])
-        if not is_point:
+    count = on = crossed = 0
+    for s in range(n + m):
+        is_point = s < n
+        if s == n:
             told[COST] = 0.5 * cost
-        for s in range(used):
-            at = (2 * s + 1) * there // (2 * used)
+        if is_point:
+            px, py, pz = points[s, 0] - cx, points[s, 1] - cy, points[s, 2] - cz
+            dx, dy, dz = points[s, 3], points[s, 4], points[s, 5]
+        else:  # the point of the ray that is nearest to the head's centre
+            px, py, pz = rays[s - n, 0] - cx, rays[s - n, 1] - cy, rays[s - n, 2] - cz
+            dx, dy, dz = rays[s - n, 3], rays[s - n, 4], rays[s - n, 5]
+            along = px * dx + py * dy + pz * dz
+            px -= along * dx
+            py -= along * dy
+            pz -= along * dz
+        # in voxels of the template
+        x = (r00 * px + r10 * py + r20 * pz) * shrink
+        y = (r01 * px + r11 * py + r21 * pz) * shrink
+        z = (r02 * px + r12 * py + r22 * pz) * shrink
+        fx, fy, fz = np.floor(x - lx), np.floor(y - ly), np.floor(z - lz)
+        if not ((fx >= 0.0) & (fy >= 0.0) & (fz >= 0.0) & (fx < nx) & (fy < ny) & (fz < nz)):
             if is_point:
-                px, py, pz = samples[at, 0] - cx, samples[at, 1] - cy, samples[at, 2] - cz
-                dx, dy, dz = samples[at, 3], samples[at, 4], samples[at, 5]
-            else:  # the point of the ray that is nearest to the head's centre
-                px, py, pz = rays[at, 0] - cx, rays[at, 1] - cy, rays[at, 2] - cz
-                dx, dy, dz = rays[at, 3], rays[at, 4], rays[at, 5]
-                along = px * dx + py * dy + pz * dz
-                px -= along * dx
-                py -= along * dy
-                pz -= along * dz
-            # in voxels of the template
-            x = (r00 * px + r10 * py + r20 * pz) * shrink
-            y = (r01 * px + r11 * py + r21 * pz) * shrink
-            z = (r02 * px + r12 * py + r22 * pz) * shrink
-            fx, fy, fz = np.floor(x - lx), np.floor(y - ly), np.floor(z - lz)
-            if not ((fx >= 0.0) & (fy >= 0.0) & (fz >= 0.0) & (fx < nx) & (fy < ny) & (fz < nz)):
-                if is_point:
-                    cost += k2
-                continue
-            row = rows[int(fx), int(fy), int(fz)]
-            gx, gy, gz = np.float64(row[1]), np.float64(row[2]), np.float64(row[3])
-            ax, ay, az = x - lx - fx - 0.5, y - ly - fy - 0.5, z - lz - fz - 0.5
-            value = row[0] + voxel_m * (gx * ax + gy * ay + gz * az)
-            for i in range(modes):
-                value += state[13 + i] * row[5 + i]
-            e = scale * value
-            variance = scale * scale * row[4] * row[4]
-            if is_point:
-                toward = gx * (r00 * dx + r10 * dy + r20 * dz)
-                toward += gy * (r01 * dx + r11 * dy + r21 * dz)
-                toward += gz * (r02 * dx + r12 * dy + r22 * dz)
-                noise = samples[at, 6] * toward
-                variance += noise * noise + samples[at, 7] * samples[at, 7]
-                weight = 1.0
-            elif e >= 0.0:
-                continue
-            else:
-                weight = RAY_WEIGHT
-                crossed += 1
-            squared = e * e / variance
-            damp = 1.0 / (1.0 + squared / k2)
-            cost += weight * squared * damp
-            if is_point:
-                cost += SIGMA_WEIGHT * damp * np.log(variance / (SIGMA_UNIT_M * SIGMA_UNIT_M))
-                on += squared < k2
-            if damp < LEAST_DAMPING:
-                continue
-            metres = scale * voxel_m
-            J[0], J[1], J[2] = -gx, -gy, -gz
-            J[3] = metres * (gy * z - gz * y)
-            J[4] = metres * (gz * x - gx * z)
-            J[5] = metres * (gx * y - gy * x)
-            J[6] = scale * (value - voxel_m * (gx * x + gy * y + gz * z))
-            for i in range(modes):
-                J[7 + i] = scale * row[5 + i]
-            J[RESIDUAL] = e
-            _add(A, J, weight * damp * damp / variance, size)
+                cost += k2
+            continue
+        row = rows[int(fx), int(fy), int(fz)]
+        gx, gy, gz = np.float64(row[1]), np.float64(row[2]), np.float64(row[3])
+        ax, ay, az = x - lx - fx - 0.5, y - ly - fy - 0.5, z - lz - fz - 0.5
+        value = row[0] + voxel_m * (gx * ax + gy * ay + gz * az)
+        for i in range(modes):
+            value += state[13 + i] * row[5 + i]
+        e = scale * value
+        variance = scale * scale * row[4] * row[4]
+        weight = 1.0
+        if is_point:
+            toward = gx * (r00 * dx + r10 * dy + r20 * dz)
+            toward += gy * (r01 * dx + r11 * dy + r21 * dz)
+            toward += gz * (r02 * dx + r12 * dy + r22 * dz)
+            noise = points[s, 6] * toward
+            variance += noise * noise + points[s, 7] * points[s, 7]
+        elif e >= 0.0:
+            continue
+        else:
+            weight = RAY_WEIGHT
+            crossed += 1
+        squared, bound = e * e, k2 * variance
+        share = k2 / (bound + squared)
+        damp = share * variance
+        cost += weight * share * squared
+        if is_point:
+            cost += SIGMA_WEIGHT * damp * np.log(variance / (SIGMA_UNIT_M * SIGMA_UNIT_M))
+            on += squared < bound
+        if damp < LEAST_DAMPING or not steps:
+            continue
+        J[0, count], J[1, count], J[2, count] = -gx, -gy, -gz
+        J[3, count] = metres * (gy * z - gz * y)
+        J[4, count] = metres * (gz * x - gx * z)
+        J[5, count] = metres * (gx * y - gy * x)
+        J[6, count] = scale * (value - voxel_m * (gx * x + gy * y + gz * z))
+        for i in range(modes):
+            J[7 + i, count] = scale * row[5 + i]
+        J[RESIDUAL, count], J[WEIGHT, count] = e, weight * damp * share
+        count += 1
+    if m == 0:
+        told[COST] = 0.5 * cost
     told[ON_SURFACE], told[CROSSED] = on, crossed
-    w = 1.0 / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
-    cost += w * (cx * cx + cy * cy + cz * cz)
     for i in range(3):
-        A[i, i] += w
-        A[i, RESIDUAL] += w * (state[3 + i] * cx + state[6 + i] * cy + state[9 + i] * cz)
-    w = 1.0 / (SCALE_SIGMA * SCALE_SIGMA)
-    cost += w * state[12] * state[12]
-    A[6, 6] += w
-    A[6, RESIDUAL] += w * state[12]
+        cost += state[i] * state[i] / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
+    cost += state[12] * state[12] / (SCALE_SIGMA * SCALE_SIGMA)
     for i in range(modes):
         cost += state[13 + i] * state[13 + i]
-        A[7 + i, 7 + i] += 1.0
-        A[7 + i, RESIDUAL] += state[13 + i]
     if upright:  # r20 r21 r22 is the world's up in the head's axes
-        for i in range(size):
-            J[i] = 0.0
-        w = 1.0 / (PITCH_SIGMA * PITCH_SIGMA)
-        cost += w * r20 * r20
-        J[4], J[5], J[RESIDUAL] = -r22, r21, r20
-        _add(A, J, w, size)
-        w = 1.0 / (ROLL_SIGMA * ROLL_SIGMA)
-        cost += w * r21 * r21
-        J[3], J[4], J[5], J[RESIDUAL] = r22, 0.0, -r20, r21
-        _add(A, J, w, size)
+        cost += r20 * r20 / (PITCH_SIGMA * PITCH_SIGMA) + r21 * r21 / (ROLL_SIGMA * ROLL_SIGMA)
+    if steps:
+        whole = max((count + LANES - 1) // LANES, 1) * LANES
+        for i in range(WEIGHTED):
+            for s in range(count, whole):
+                J[i, s] = 0.0
+        _accumulate(J, whole, size, A)
+        _add_priors(state, modes, upright, A)
     return 0.5 * cost
 
 
 @rule
-def _solve(A, x, size):  # type: ignore[no-untyped-def]
+def _add_priors(state, modes, upright, A):  # type: ignore[no-untyped-def]
+    """Add the priors on place, size, shape and, if ``upright``, on pitch and roll."""
+    w = 1.0 / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
+    for i in range(3):
+        A[i, i] += w
+        A[i, RESIDUAL] += w * (state[3 + i] * state[0] + state[6 + i] * state[1] + state[9 + i] * state[2])
+    w = 1.0 / (SCALE_SIGMA * SCALE_SIGMA)
+    A[6, 6] += w
+    A[6, RESIDUAL] += w * state[12]
+    for i in range(modes):
+        A[7 + i, 7 + i] += 1.0
+        A[7 + i, RESIDUAL] += state[13 + i]
+    if upright:
+        ux, uy, uz = state[9], state[10], state[11]
+        _add_turn(A, 0.0, -uz, uy, ux, 1.0 / (PITCH_SIGMA * PITCH_SIGMA))
+        _add_turn(A, uz, 0.0, -ux, uy, 1.0 / (ROLL_SIGMA * ROLL_SIGMA))
+
+
+@bare_kernel
+def solve(A, x, size):  # type: ignore[no-untyped-def]
     """Leave the Cholesky factor in the lower half of A, and the step -A⁻¹ (column RESIDUAL) in x; return ½ log det."""
     half_log_det = 0.0
     for i in range(size):
@@ -240,56 +328,42 @@ def _move(state, x, size):  # type: ignore[no-untyped-def]
     state[12] = min(max(state[12], -LARGEST_LOG_SCALE), LARGEST_LOG_SCALE)
 
 
-@kernel
-def align(samples, n, rays, m, starts, upright, rows, low, voxel_m, coarse, fine, told, covariances):  # type: ignore[no-untyped-def]
-    """Try all ``starts`` (S, 9), refine the best; return how many were refined.
+@bare_kernel
+def align(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def]
+    """Try all ``starts`` (S, 9) on the ``n`` samples and ``m`` rays of ``work``, and refine the best.
 
-    The states go to ``fine`` (MOST_REFINED, STATE), what they cost to ``told`` (.., TOLD), the covariances of shift and
-    turn, in the head's axes, to ``covariances`` (.., 6, 6). ``coarse`` (S, STATE) is scrap. A single start is refined
-    at once.
+    ``work`` is a :class:`Scratch`, ``template`` a :class:`~headvox.template.Template`. Returned is how many were
+    refined; ``work`` has their states, what they cost and their covariances. A single start is refined at once.
     """
-    A = np.empty((PARAMETERS, PARAMETERS + 1))
-    J = np.empty(PARAMETERS + 1)
-    x = np.empty(PARAMETERS)
-    scrap = np.empty(TOLD)
-    most = np.empty(2, np.int64)
-    most[0], most[1] = COARSE_SAMPLES, 0
-    costs = np.zeros(starts.shape[0])
-    size = 7 + COARSE_MODES
+    rows, low, voxel_m = template.rows, template.low, template.voxel_m
+    points, passing, J, A, x = work.points, work.passing, work.J, work.A, work.x
+    coarse, fine, told, costs = work.coarse, work.fine, work.told, work.costs
+    count = starts.shape[0]
+    if count > 1:
+        used = choose(work.samples, n, points, COARSE_SAMPLES)
+        size = 7 + COARSE_MODES
     least = np.inf
-    for i in range(starts.shape[0]):
+    for i in range(count):
         state = coarse[i]
         for j in range(STATE):
             state[j] = starts[i, j - 3] if 3 <= j < 12 else 0.0
-        if starts.shape[0] > 1:
+        costs[i] = 0.0
+        if count > 1:
             for step in range(COARSE_STEPS + 1):
-                k = COARSE_K - min(step, COARSE_STEPS - 1)
+                k, steps = COARSE_K - min(step, COARSE_STEPS - 1), step < COARSE_STEPS
                 costs[i] = linearise(
-                    samples,
-                    n,
-                    rays,
-                    m,
-                    most,
-                    COARSE_MODES,
-                    k,
-                    upright,
-                    rows,
-                    low,
-                    voxel_m,
-                    state,
-                    A,
-                    J,
-                    scrap,
-                )
-                if step < COARSE_STEPS:
-                    _solve(A, x, size)
+                    points, used, passing, 0, COARSE_MODES, k, upright, steps, rows, low, voxel_m, state, J, A,
+                    told[MOST_REFINED],
+                )  # fmt: skip
+                if steps:
+                    solve(A, x, size)
                     _move(state, x, size)
         least = min(least, costs[i])
-    most[0], most[1] = FINE_SAMPLES, FINE_RAYS
+    used, rays = choose(work.samples, n, points, FINE_SAMPLES), choose(work.rays, m, passing, FINE_RAYS)
     refined = 0
-    while refined < fine.shape[0]:
+    while refined < MOST_REFINED:
         best = 0
-        for i in range(starts.shape[0]):
+        for i in range(count):
             if costs[i] < costs[best]:
                 best = i
         if costs[best] == np.inf or (refined >= 2 and costs[best] > least + MARGIN):
@@ -306,15 +380,28 @@ def align(samples, n, rays, m, starts, upright, rows, low, voxel_m, coarse, fine
         state = fine[refined]
         for j in range(STATE):
             state[j] = coarse[best, j]
-        cost = 0.0
         for step in range(FINE_STEPS + 1):
             k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
             cost = linearise(
-                samples, n, rays, m, most, MODES, k, upright, rows, low, voxel_m, state, A, J, told[refined]
+                points,
+                used,
+                passing,
+                rays,
+                MODES,
+                k,
+                upright,
+                True,
+                rows,
+                low,
+                voxel_m,
+                state,
+                J,
+                A,
+                told[refined],
             )
-            told[refined, EVIDENCE] = cost + _solve(A, x, PARAMETERS)
+            told[refined, EVIDENCE] = cost + solve(A, x, PARAMETERS)
             if step < FINE_STEPS:
                 _move(state, x, PARAMETERS)
-        _invert(A, x, covariances[refined])
+        _invert(A, x, work.covariances[refined])
         refined += 1
     return refined

@@ -20,6 +20,7 @@ from typing import Any
 from weakref import finalize
 
 import numba
+import numpy.typing as npt
 
 
 def _source_stamp() -> tuple[str, int]:
@@ -62,6 +63,17 @@ def rule(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a scalar rule that kernels of the same file inline."""
     compiled: Callable[..., Any] = numba.njit(inline="always", error_model="numpy")(function)
     return compiled
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return a view of ``array`` that cannot be written to.
+
+    Numba compiles a loop anew for arrays that must not be written, such as lie in a file or in a camera's buffer.
+    Whatever comes from outside goes through this, so each loop is compiled once.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 class Threads:

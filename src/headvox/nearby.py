@@ -6,10 +6,14 @@ covers is read, every so many pixels. Coordinates are metres from the candidate,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 
 from headvox.data import F64, Frame
-from headvox.kernels import kernel, rule
+from headvox.kernels import bare_kernel, read_only, rule
 
 REACH_M = 0.25
 MOST_SAMPLES = 8192  # of one candidate, shared by all sensors
@@ -61,13 +65,13 @@ def _window(middle, depth, reach, focal, centre, size):  # type: ignore[no-untyp
     return int(min(max(first, 0.0), size)), int(min(max(last + 2.0, 0.0), size))
 
 
-@kernel
-def gather_depth(depth, lens, T, reach, limit, samples, rays, counts):  # type: ignore[no-untyped-def]
+@bare_kernel
+def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
     """Add what one depth image shows near the origin of the frame that ``T`` (3, 4) maps the camera to.
 
     ``lens`` holds fx, fy, cx, cy and the depth scale. Points within ``reach`` go to ``samples``, rays that pass
-    within ``reach`` and end behind it to ``rays``; ``counts`` (2,) says how many there are of each, ``limit`` (2,)
-    how many there may be.
+    within ``reach`` and end behind it to ``rays``, after the ``n`` and ``m`` that are there; there may be ``most_n``
+    and ``most_m``. Returned is how many there are then.
     """
     fx, fy, cx, cy, scale = lens[0], lens[1], lens[2], lens[3], lens[4]
     # the origin in the camera's frame
@@ -75,14 +79,13 @@ def gather_depth(depth, lens, T, reach, limit, samples, rays, counts):  # type: 
     oy = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
     oz = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
     if oz < -reach:
-        return
+        return n, m
     u0, u1 = _window(ox, oz, reach, fx, cx, depth.shape[1])
     v0, v1 = _window(oy, oz, reach, fy, cy, depth.shape[0])
-    most = max(1, min(MOST_PIXELS, limit[0] - counts[0]))
+    most = max(1, min(MOST_PIXELS, most_n - n))
     stride = 1
     while ((u1 - u0 + stride - 1) // stride) * ((v1 - v0 + stride - 1) // stride) > most:
         stride += 1
-    n, m = counts[0], counts[1]
     reach2, distance2 = reach * reach, ox * ox + oy * oy + oz * oz
     for v in range(v0, v1, stride):
         y = (v - cy) / fy
@@ -95,7 +98,7 @@ def gather_depth(depth, lens, T, reach, limit, samples, rays, counts):  # type: 
             length = np.sqrt(x * x + y * y + 1.0)
             dx, dy, dz = x * z - ox, y * z - oy, z - oz
             if dx * dx + dy * dy + dz * dz < reach2:
-                if n < limit[0]:
+                if n < most_n:
                     _view(T, x, y, 1.0, length, samples, n)
                     _place(T, z * length, samples, n)
                     samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * z * z
@@ -103,23 +106,22 @@ def gather_depth(depth, lens, T, reach, limit, samples, rays, counts):  # type: 
                     n += 1
                 continue
             along = (x * ox + y * oy + oz) / length  # where the ray is nearest to the origin
-            if distance2 - along * along < reach2 and 0.0 < along < z * length and m < limit[1]:
+            if distance2 - along * along < reach2 and 0.0 < along < z * length and m < most_m:
                 _view(T, x, y, 1.0, length, rays, m)
                 _place(T, along, rays, m)
                 m += 1
-    counts[0], counts[1] = n, m
+    return n, m
 
 
-@kernel
-def gather_points(points, T, knows, reach, limit, samples, rays, counts):  # type: ignore[no-untyped-def]
+@bare_kernel
+def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
     """Add what a cloud shows; ``T`` (3, 4) maps its frame, ``knows`` says whether the sensor is at its origin.
 
-    When there is more than ``limit`` lets through, every second one is kept, so the rest stays evenly spread.
+    When there is more than ``most_n`` or ``most_m``, every second one is kept, so the rest stays evenly spread.
     """
     ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
     reach2, distance2 = reach * reach, ox * ox + oy * oy + oz * oz
-    first_n, first_m = counts[0], counts[1]
-    n, m = first_n, first_m
+    first_n, first_m = n, m
     hits, passes, every_hit, every_pass = 0, 0, 1, 1
     for i in range(0, points.shape[0], max(1, (points.shape[0] + MOST_VISITS - 1) // MOST_VISITS)):
         px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -131,7 +133,7 @@ def gather_points(points, T, knows, reach, limit, samples, rays, counts):  # typ
         if wx * wx + wy * wy + wz * wz < reach2:
             hits += 1
             if hits % every_hit == 0:
-                if n == limit[0]:
+                if n == most_n:
                     n = _thin(samples, first_n, n)
                     every_hit *= 2
                 samples[n, 0], samples[n, 1], samples[n, 2] = wx, wy, wz
@@ -148,40 +150,61 @@ def gather_points(points, T, knows, reach, limit, samples, rays, counts):  # typ
         if knows and 0.0 < along < squared and distance2 - along * along / squared < reach2:
             passes += 1
             if passes % every_pass == 0:
-                if m == limit[1]:
+                if m == most_m:
                     m = _thin(rays, first_m, m)
                     every_pass *= 2
                 length = np.sqrt(squared)
                 rays[m, 3], rays[m, 4], rays[m, 5] = x / length, y / length, z / length
                 _place(T, along / length, rays, m)
                 m += 1
-    counts[0], counts[1] = n, m
+    return n, m
 
 
-def gather(frame: Frame, centre: F64, samples: F64, rays: F64) -> tuple[int, int]:
-    """Fill ``samples`` (S, SAMPLE) and ``rays`` (R, RAY) with what ``frame`` shows near ``centre`` (3,), metres.
+class Sensor(NamedTuple):
+    """A depth image or a cloud of a frame as the loops read it."""
 
-    Returns how many of each there are. Every sensor has the same share of the room.
-    """
-    counts, room = np.zeros(2, np.int64), np.array([len(samples), len(rays)])
-    left = len(frame.depths) + len(frame.clouds)
+    readings: npt.NDArray[Any]
+    """(height, width) uint16 of an image, (N, 3) float32 of a cloud; read only"""
+    T: F64
+    """(3, 4), maps the sensor's coordinates to the world"""
+    lens: F64 | None
+    """fx, fy, cx, cy and the depth scale; None of a cloud"""
+    knows: bool
+    """whether the sensor is at the origin of its coordinates"""
+
+
+def sensors_of(frame: Frame) -> list[Sensor]:
+    """Return the images and the clouds of ``frame``."""
+    sensors = []
     for image in frame.depths:
         c = image.intrinsics
         lens = np.array([c.fx, c.fy, c.cx, c.cy, c.depth_scale])
-        T, limit = _placed(image.T_world_camera, centre), counts + (room - counts) // left
-        gather_depth(image.depth, lens, T, REACH_M, limit, samples, rays, counts)
-        left -= 1
+        sensors.append(Sensor(read_only(image.depth), _rigid(image.T_world_camera), lens, True))
     for cloud in frame.clouds:
         knows = cloud.T_world_sensor is not None
-        T = _placed(np.eye(4) if cloud.T_world_sensor is None else cloud.T_world_sensor, centre)
-        limit = counts + (room - counts) // left
-        gather_points(cloud.points, T, knows, REACH_M, limit, samples, rays, counts)
-        left -= 1
-    return int(counts[0]), int(counts[1])
+        T = _rigid(np.eye(4) if cloud.T_world_sensor is None else cloud.T_world_sensor)
+        sensors.append(Sensor(read_only(cloud.points), T, None, knows))
+    return sensors
 
 
-def _placed(T_world_sensor: F64, centre: F64) -> F64:
-    """Return (3, 4) float64 that maps the sensor's coordinates to metres from ``centre``."""
-    T = np.array(T_world_sensor[:3], dtype=np.float64)
-    T[:, 3] -= centre
-    return T
+def gather(sensors: Sequence[Sensor], centre: F64, samples: F64, rays: F64) -> tuple[int, int]:
+    """Fill ``samples`` (S, SAMPLE) and ``rays`` (R, RAY) with what was measured near ``centre`` (3,), world, metres.
+
+    Returns how many of each there are. Every sensor has the same share of the room.
+    """
+    n = m = 0
+    for left, sensor in zip(range(len(sensors), 0, -1), sensors, strict=True):
+        T = sensor.T.copy()
+        T[:, 3] -= centre
+        most_n, most_m = n + (len(samples) - n) // left, m + (len(rays) - m) // left
+        if sensor.lens is None:
+            n, m = gather_points(
+                sensor.readings, T, sensor.knows, REACH_M, n, m, most_n, most_m, samples, rays
+            )
+        else:
+            n, m = gather_depth(sensor.readings, sensor.lens, T, REACH_M, n, m, most_n, most_m, samples, rays)
+    return n, m
+
+
+def _rigid(T_world_sensor: F64) -> F64:
+    return np.ascontiguousarray(T_world_sensor[:3], dtype=np.float64)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from headvox.align import Scratch
 from headvox.config import DetectorConfig
 from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
@@ -21,7 +22,7 @@ from headvox.gate import candidate_reach, gate_columns, gate_tables, list_passed
 from headvox.integral import box_reach, integrate, set_corners, shape_with_margins
 from headvox.kernels import Threads
 from headvox.masks import SCORE_UNIT, CompiledStages, compile_cascade, load_cascade
-from headvox.pose import Scratch, fit_poses
+from headvox.pose import fit_poses
 from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
 from headvox.simd import LANES
 from headvox.suppress import PEAK_REACH, local_maxima, suppress_overlaps
@@ -454,7 +455,7 @@ class _Memory:
         self.sees = cascade.source.sees
         self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
         self.judge = _Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
-        self.scratch = [Scratch() for _ in range(threads if detector.config.refine == "pose" else 0)]
+        self.scratch = [Scratch.new() for _ in range(threads if detector.config.refine == "pose" else 0)]
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 

@@ -276,6 +276,24 @@ def running_sums(typingctx, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def total(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return the sum of all lanes of a float64 vector: of its halves, of the halves of that, and so on."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        (sums,) = arguments
+        half = LANES // 2
+        while half:
+            low, high = (
+                ir.Constant(ir.VectorType(ir.IntType(32), half), list(range(k, k + half))) for k in (0, half)
+            )
+            sums = builder.fadd(*(builder.shuffle_vector(sums, sums, places) for places in (low, high)))
+            half //= 2
+        return builder.extract_element(sums, ir.Constant(ir.IntType(32), 0))
+
+    return a.scalar(a), emit
+
+
+@intrinsic
 def last(typingctx, a):  # type: ignore[no-untyped-def]
     """Return the last lane of ``a`` in every lane."""
 

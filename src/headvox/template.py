@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
+from typing import NamedTuple
 
 import numpy as np
 
 from headvox.data import F32, F64
 
 MODES = 10
-ROW = 5 + MODES  # distance, gradient (3), sigma, modes
+LINE = 16  # of a cache, in float32
+ROW = LINE  # distance, gradient (3), sigma, modes, one unused
 
 
-@dataclass(frozen=True, slots=True)
-class Template:
+class Template(NamedTuple):
     """The mean head on a grid in its own frame, made by ``tools/bake_template.py``.
 
     ``rows`` (X, Y, Z, ROW) float32: of each voxel's centre the signed distance to the surface (m, above zero
@@ -47,9 +47,17 @@ def load_template() -> Template:
         sigma = asset["sigma"] * np.float32(asset["sigma_unit_m"])
         temperature, shift, turn = (float(v) for v in asset["calibration"])
         low, voxel_m, size_m = asset["low_m"], float(asset["voxel_m"]), float(asset["size_m"])
-    rows = np.zeros((*mean.shape, ROW), np.float32)
+    rows = _aligned((*mean.shape, ROW))
     rows[..., 0] = mean
     rows[..., 1:4] = np.stack(np.gradient(mean, voxel_m), axis=-1)
     rows[..., 4] = sigma
     rows[..., 5 : 5 + MODES] = np.moveaxis(modes, 0, -1)
     return Template(rows, low, voxel_m, 0.5 * size_m, temperature, shift, turn)
+
+
+def _aligned(shape: tuple[int, ...]) -> F32:
+    """Return zeros that begin where a line of the cache does."""
+    size = int(np.prod(shape))
+    room = np.zeros(size + LINE, np.float32)
+    first = -room.ctypes.data // room.itemsize % LINE
+    return room[first : first + size].reshape(shape)

@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from headvox import __version__
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, Undecided
 from headvox.sinks import SUFFIXES
 from headvox.table import printable, table
 
 if TYPE_CHECKING:
     from headvox.config import Config, DetectorConfig, TrackerConfig
+    from headvox.sources.options import SourceOptions
 
 GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -70,6 +71,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         _complain(*_words(error))
+        if isinstance(error, Undecided):
+            for choice in error.choices:
+                print(printable(f"    {choice}"), file=sys.stderr)
+            return USAGE
         return KNOWN_ERROR
     return code
 
@@ -140,7 +145,8 @@ def _run(args: argparse.Namespace) -> int:
 
     path = args.source or sample_folder()
     with ExitStack() as stack:
-        source = stack.enter_context(closing(open_source(path)))
+        notes: list[str] = []
+        source = stack.enter_context(closing(open_source(path, source_options_of(args), notes.append)))
 
         from headvox.live import Live
         from headvox.pipeline import Detector
@@ -154,6 +160,8 @@ def _run(args: argparse.Namespace) -> int:
         live = stack.enter_context(closing(Live(sys.stderr, source.length)))
         if args.source is None:
             live.note(f"no SOURCE given: running the sample that ships with headvox, {path}")
+        for note in notes:
+            live.note(f"headvox: {note}")
         detector = stack.enter_context(closing(Detector(config)))
         sinks: list[Sink] = []
         if args.output is not None:
@@ -184,7 +192,10 @@ def _run(args: argparse.Namespace) -> int:
 def _info(args: argparse.Namespace) -> int:
     from headvox.sources.describe import describe
 
-    print(table([], [list(row) for row in describe(args.source)]))
+    notes: list[str] = []
+    print(table([], [list(row) for row in describe(args.source, source_options_of(args), notes.append)]))
+    for note in notes:
+        _complain(note, "")
     return GOOD
 
 
@@ -286,6 +297,17 @@ def tracker_config_of(args: argparse.Namespace) -> TrackerConfig:
     return _with_flags(TrackerConfig() if args.config is None else load_tracker_config(args.config), args)
 
 
+def source_options_of(args: argparse.Namespace) -> SourceOptions:
+    """Return what the flags tell about the source."""
+    from headvox.sources.options import SourceOptions, mount
+
+    return SourceOptions(
+        topics=tuple(args.topic),
+        frame=args.frame,
+        T_world_mount=None if args.mount is None else mount(*args.mount),
+    )
+
+
 def _with_flags(config: Config, args: argparse.Namespace) -> Config:
     from dataclasses import fields, replace
 
@@ -327,14 +349,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"headvox {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    run = _command(commands, "run", _run, "find heads in a recording, a cloud, or a folder of clouds")
+    run = _command(commands, "run", _run, "find heads in a recording, a bag, a cloud, or a folder of clouds")
     run.add_argument(
         "source",
         nargs="?",
         type=Path,
         metavar="SOURCE",
-        help="a depth recording (folder), a ply, pcd, npy or npz file, or a folder of those; "
-        "without it, the sample recording that ships with headvox",
+        help="a depth recording (folder), a bag of ROS 1 or 2 (.bag, .mcap, sqlite3), a ply, pcd, npy or npz file, "
+        "or a folder of those; without it, the sample recording that ships with headvox",
     )
     run.add_argument("--json", action="store_true", help="print one JSON object a frame, and nothing else")
     run.add_argument(
@@ -351,12 +373,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
     run.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
+    add_source_options(run)
     add_settings(run)
     add_tracker_settings(run)
     run.usage = "%(prog)s [SOURCE] [--json] [-o OUT] [flags]"
 
     info = _command(commands, "info", _info, "tell what a source holds")
     info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
+    add_source_options(info)
 
     config = _command(commands, "config", _show_config, "print the settings as TOML, as --config takes them")
     add_settings(config)
@@ -449,6 +473,22 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--threads", type=whole_number, metavar="N", help="threads for a frame; the heads are the same"
+    )
+
+
+def add_source_options(parser: argparse.ArgumentParser) -> None:
+    """Add a flag for each thing that a bag may not tell by itself."""
+    group = parser.add_argument_group("bags", "what a bag does not tell by itself")
+    group.add_argument(
+        "--topic", action="append", default=[], metavar="NAME", help="read this topic (again for another)"
+    )
+    group.add_argument("--frame", metavar="NAME", help="frame that the heads are to be in; its z points up")
+    group.add_argument(
+        "--mount",
+        nargs=6,
+        type=number,
+        metavar=("X", "Y", "Z", "ROLL", "PITCH", "YAW"),
+        help="where that frame, or the one sensor, stands: metres and degrees; PITCH above 0 looks down",
     )
 
 

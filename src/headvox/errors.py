@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class HeadvoxError(Exception):
     """Input, configuration or files that headvox cannot use.
@@ -17,3 +19,14 @@ class HeadvoxError(Exception):
 
     def __str__(self) -> str:
         return f"{self.what} {self.do}".rstrip()
+
+
+class Undecided(HeadvoxError):
+    """Input that can be taken in several ways: the user has to choose, from ``choices`` (lines to show).
+
+    The command line exits with 2 then, as for flags that are missing.
+    """
+
+    def __init__(self, what: str, do: str, choices: Sequence[str] = ()) -> None:
+        super().__init__(what, do)
+        self.choices = tuple(choices)

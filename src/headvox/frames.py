@@ -9,6 +9,10 @@ from headvox.data import F64, U16, Intrinsics
 from headvox.errors import HeadvoxError
 
 RIGID_TOLERANCE = 1e-3  # extrinsics typed by hand have four digits
+OPTICAL: F64 = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""T_body_optical: from x right, y down, z forward to x forward, y left, z up."""
 
 
 def as_rigid(matrix: npt.ArrayLike, name: str) -> F64:

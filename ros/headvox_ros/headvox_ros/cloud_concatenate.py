@@ -18,10 +18,10 @@ from headvox.data import F32, Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.frames import unproject
 from headvox.fuse import Region, fuse
+from headvox.ros.synchronise import NS
 from headvox_ros.node import SensorNode, run
 from headvox_ros.parameters import Parameter
 from headvox_ros.sensors import RELIABILITIES
-from headvox_ros.synchronise import NS
 
 PARAMETERS = [
     Parameter("rate_hz", 0.0, "Publish at most so often; 0 for every set of readings.", (0.0, 1000.0)),

@@ -18,12 +18,12 @@ from headvox.data import Frame
 from headvox.errors import HeadvoxError
 from headvox.masks import load_cascade
 from headvox.pipeline import Detector
+from headvox.ros.synchronise import NS
 from headvox.track import Tracker
 from headvox.warmup import warm_up
 from headvox_ros import outputs
 from headvox_ros.node import SensorNode, run
 from headvox_ros.parameters import Parameter, config_from, parameters_of
-from headvox_ros.synchronise import NS
 
 PARAMETERS = [
     *parameters_of(DetectorConfig, "detector"),

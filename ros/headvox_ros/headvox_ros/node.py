@@ -25,10 +25,11 @@ from rclpy.signals import SignalHandlerOptions
 
 from headvox.data import Frame
 from headvox.errors import HeadvoxError
+from headvox.ros.messages import info_topic
+from headvox.ros.synchronise import Reading, Synchroniser
 from headvox_ros.parameters import Parameter
-from headvox_ros.sensors import RELIABILITIES, Sensors, info_topic, seconds_to_ns
+from headvox_ros.sensors import RELIABILITIES, Sensors, seconds_to_ns
 from headvox_ros.statistics import Statistics
-from headvox_ros.synchronise import Reading, Synchroniser
 
 DIAGNOSTICS_EVERY_S = 1.0
 SENSOR_PARAMETERS = [

@@ -33,10 +33,10 @@ from headvox.data import F32, DepthImage, Frame
 from headvox.errors import HeadvoxError
 from headvox.evaluate.truth import FILE as TRUTH
 from headvox.evaluate.truth import read_truth
+from headvox.ros.synchronise import NS
 from headvox.sources import open_source
 from headvox_ros.cloud_concatenate import as_message_data, cloud_message
 from headvox_ros.sensors import RELIABILITIES
-from headvox_ros.synchronise import NS
 
 WORLD = "world"
 

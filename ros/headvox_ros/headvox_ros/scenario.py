@@ -26,9 +26,9 @@ from geometry_msgs.msg import PoseArray
 from headvox.errors import HeadvoxError
 from headvox.evaluate.match import Match, Rules, match
 from headvox.evaluate.truth import TrueHeads, read_truth
+from headvox.ros.messages import stamp_ns
+from headvox.ros.synchronise import NS
 from headvox.sources import open_source
-from headvox_ros.messages import stamp_ns
-from headvox_ros.synchronise import NS
 
 INPUTS = {"depth": ("depths", "depth/image_rect_raw"), "cloud": ("clouds", "depth/points")}
 PROFILE = "config/fastdds_large_clouds.xml"

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
@@ -15,11 +14,11 @@ from tf2_msgs.msg import TFMessage
 
 from headvox.data import Cloud, DepthImage, Frame
 from headvox.errors import HeadvoxError
+from headvox.ros.messages import cloud_points, depth_image, intrinsics, stamp_ns
+from headvox.ros.synchronise import NS, Reading, Synchroniser
+from headvox.ros.transforms import NoTransform, TransformBuffer, set_from
 from headvox_ros.latest import Latest
-from headvox_ros.messages import cloud_points, depth_image, intrinsics, stamp_ns
 from headvox_ros.statistics import Statistics
-from headvox_ros.synchronise import NS, Reading, Synchroniser
-from headvox_ros.transforms import NoTransform, TransformBuffer
 
 RELIABILITIES = {"best_effort": ReliabilityPolicy.BEST_EFFORT, "reliable": ReliabilityPolicy.RELIABLE}
 DEPTH = 2  # messages that wait for us: a longer queue would only hold older ones
@@ -76,16 +75,7 @@ class Sensors:
     # ------------------------------------------------------------------------------------------------ the node's thread
 
     def _on_transforms(self, message: TFMessage, is_static: bool) -> None:
-        for stamped in message.transforms:
-            t, q = stamped.transform.translation, stamped.transform.rotation
-            self.transforms.set(
-                stamped.header.frame_id,
-                stamped.child_frame_id,
-                stamp_ns(stamped.header.stamp),
-                np.array([t.x, t.y, t.z]),
-                np.array([q.x, q.y, q.z, q.w]),
-                is_static,
-            )
+        set_from(self.transforms, message, is_static)
 
     def _on_info(self, name: str, message: CameraInfo) -> None:
         self._infos[name] = message
@@ -184,11 +174,6 @@ class Sensors:
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._sets.close()
-
-
-def info_topic(depth_topic: str) -> str:
-    """Return where a depth image's CameraInfo is by convention: ``camera_info`` beside it."""
-    return depth_topic.rpartition("/")[0] + "/camera_info"
 
 
 def seconds_to_ns(seconds: float) -> int:

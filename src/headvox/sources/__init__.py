@@ -9,12 +9,16 @@ is None when nobody knows; ``close`` may be called at any time and more than onc
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
+
+if TYPE_CHECKING:
+    from headvox.sources.options import SourceOptions
 
 
 class Source(Protocol):
@@ -32,27 +36,49 @@ class Source(Protocol):
         ...
 
 
-def open_source(path: str | os.PathLike[str]) -> Source:
+def open_source(
+    path: str | os.PathLike[str],
+    options: SourceOptions | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Source:
     """Open whatever lies at a path; its kind is told by its content, never by its name.
 
-    A folder with a ``recording.json`` (or that file itself) is a depth recording, any other folder is a
-    sequence of point-cloud files in natural order of their names, 1/30 s apart, and a file is one cloud: ply,
-    pcd, npy or npz.
+    A folder with a ``recording.json`` (or that file itself) is a depth recording; a folder with a ``metadata.yaml``, or
+    a file that begins like one, is a bag of ROS 1 or ROS 2; any other folder is a sequence of point-cloud files in
+    natural order of their names, 1/30 s apart, and a file is one cloud: ply, pcd, npy or npz.
+
+    Args:
+        path: of a file or a folder.
+        options: what a bag does not tell by itself; other sources take none.
+        say: told what is assumed about a bag, a line each; by default these are warnings.
 
     Raises:
-        HeadvoxError: there is nothing there, or nothing that headvox can read.
+        HeadvoxError: there is nothing there, or nothing that headvox can read; Undecided, which is one, where a bag
+            can be read in several ways.
     """
     # The kinds are imported here: `import headvox.sources` is to cost nothing.
+    from headvox.ros.bagfile import is_bag
     from headvox.sources.cloudfile import CloudFileSource
     from headvox.sources.folder import FolderSource
+    from headvox.sources.options import SourceOptions, check_unused
     from headvox.sources.recording import FILE, RecordingSource
 
     place = Path(path)
     try:
+        is_recording = place.name == FILE or (place / FILE).is_file()
+        if not is_recording and is_bag(place):
+            from headvox.sources.bag import BagSource
+
+            return BagSource(place, options or SourceOptions(), say or _warn)
+        check_unused(options, place.name)
         if place.is_dir():
-            return RecordingSource(place) if (place / FILE).is_file() else FolderSource(place)
+            return RecordingSource(place) if is_recording else FolderSource(place)
     except OSError as error:
         raise HeadvoxError(f"{place}: cannot be read: {error.strerror}.", "Check the path.") from None
-    if place.name == FILE:
-        return RecordingSource(place.parent)
-    return CloudFileSource(place)
+    except ValueError as error:  # a NUL in the path
+        raise HeadvoxError(f"{place}: cannot be read: {error}.", "Check the path.") from None
+    return RecordingSource(place.parent) if is_recording else CloudFileSource(place)
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, stacklevel=3)

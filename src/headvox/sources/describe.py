@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from headvox.data import F64, BadFrame
+from headvox.data import F64, BadFrame, Frame
 from headvox.errors import HeadvoxError
 from headvox.frames import transform, unproject
 from headvox.sources import open_source
+from headvox.sources.bag import BagSource
 from headvox.sources.cloudfile import CloudFile, CloudFileSource, read_cloud_file
 from headvox.sources.folder import FRAME_NS, FolderSource
+from headvox.sources.options import SourceOptions, listed
 from headvox.sources.recording import Camera, RecordedFrame, RecordingSource
 
 Rows = list[tuple[str, str]]
@@ -21,16 +25,21 @@ Rows = list[tuple[str, str]]
 _LOOKED_AT = 10  # frames of a recording that are decoded: enough for a box, and quick
 
 
-def describe(source_path: str | os.PathLike[str]) -> Rows:
+def describe(
+    source_path: str | os.PathLike[str],
+    options: SourceOptions | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Rows:
     """Return (what, value) rows about a source: metres, degrees, and printable characters only.
 
-    A recording is described by its ``recording.json`` and ten frames spread over it, a folder by its first
-    file that can be read.
+    A recording is described by its ``recording.json`` and ten frames spread over it, a bag by its topics and its first
+    frames, a folder by its first file that can be read. ``options`` and ``say`` are those of
+    :func:`~headvox.sources.open_source`.
 
     Raises:
         HeadvoxError: the source, or every file of a folder, cannot be used.
     """
-    source = open_source(source_path)
+    source = open_source(source_path, options, say)
     match source:
         case RecordingSource():
             rows = _recording_rows(source)
@@ -38,6 +47,8 @@ def describe(source_path: str | os.PathLike[str]) -> Rows:
             rows = _folder_rows(source)
         case CloudFileSource():
             rows = [("frames", "1"), *_file_rows(read_cloud_file(source.path))]
+        case BagSource():
+            rows = _bag_rows(source)
         case _:
             rows = [("frames", "not known" if source.length is None else str(source.length))]
     source.close()
@@ -73,6 +84,40 @@ def _folder_rows(source: FolderSource) -> Rows:
     ]
     path, cloud = _first_readable(source.paths)
     return [*rows, ("described file", path.name), *_file_rows(cloud)]
+
+
+def _bag_rows(source: BagSource) -> Rows:
+    rows = [("kind", source.bag.kind), ("heads are in", source.placing.words)]
+    read = {sensor.topic: sensor for sensor in source.sensors}
+    for name, sensor in read.items():
+        rows.append((f"reads {name}", f"{sensor.words}, {source.bag.topics[name].count} messages"))
+    others = [
+        f"{topic.name} ({topic.count})" for topic in source.bag.topics.values() if topic.name not in read
+    ]
+    rows.append(("other topics", listed(others)))
+    frames = list(islice(source, _LOOKED_AT))
+    good = [frame for frame in frames if isinstance(frame, Frame)]
+    rows.append(
+        ("looked at", f"the first {len(frames)} frames, {len(frames) - len(good)} of them cannot be read")
+    )
+    placed = [(image.name, image.T_world_camera) for frame in good[:1] for image in frame.depths]
+    rows += [(f"camera {name}", f"{_where(T)}, {_tilt(T)}") for name, T in placed]
+    return [*rows, ("box", _box(_corners(good)))]
+
+
+def _corners(frames: Iterable[Frame]) -> F64:
+    """Return the corners of the box about each reading, (2 N, 3), in the world."""
+    corners = [np.empty((0, 3))]
+    for frame in frames:
+        sets = [unproject(image.depth, image.intrinsics, image.T_world_camera) for image in frame.depths]
+        for cloud in frame.clouds:
+            finite = cloud.points[np.isfinite(cloud.points).all(axis=1)].astype(np.float64)
+            T = cloud.T_world_sensor
+            sets.append(finite if T is None else transform(T, finite))
+        for points in sets:
+            if len(points):
+                corners += [points.min(axis=0)[None], points.max(axis=0)[None]]
+    return np.concatenate(corners)
 
 
 def _first_readable(paths: list[Path]) -> tuple[Path, CloudFile]:

@@ -130,6 +130,11 @@ def depth_image(message: Any) -> U16:
         return np.where((millimetres >= 1.0) & (millimetres <= 65535.0), millimetres, 0.0).astype(np.uint16)
 
 
+def info_topic(depth_topic: str) -> str:
+    """Return where a depth image's CameraInfo is by convention: ``camera_info`` beside it."""
+    return depth_topic.rpartition("/")[0] + "/camera_info"
+
+
 def intrinsics(info: Any) -> Intrinsics:
     """Return the intrinsics in a sensor_msgs/CameraInfo, for depth in millimetres.
 

@@ -48,12 +48,17 @@ class Synchroniser:
     tolerance_ns: int
     wait_s: float
     timeout_s: float
+    expected: frozenset[str] = frozenset()
+    """Sensors that are taken to be alive from the first reading on, before anything came from them."""
+    most_open: int = 1000
+    """Sets that may wait at a time: what is held is bounded, whatever the stamps are."""
     late: int = 0
     """Readings that came after a newer set had been given out."""
     jumps: int = 0
     _newest: dict[str, Reading] = field(default_factory=dict)
     _open: list[_Open] = field(default_factory=list)
     _given_ns: float = -math.inf
+    _begun_s: float = math.inf
 
     def add(self, reading: Reading) -> list[list[Reading]]:
         """Take a reading in; return the sets that are ready by it, oldest first."""
@@ -64,6 +69,7 @@ class Synchroniser:
             self.late += 1
             return []
         self._newest[reading.sensor] = reading
+        self._begun_s = min(self._begun_s, reading.arrived_s)
         if reading.stamp_ns <= self._given_ns:
             self.late += 1
             return []
@@ -86,7 +92,10 @@ class Synchroniser:
 
     def alive(self, now_s: float) -> set[str]:
         """Return the sensors that something came from lately."""
-        return {name for name, last in self._newest.items() if now_s - last.arrived_s <= self.timeout_s}
+        heard = {name for name, last in self._newest.items() if now_s - last.arrived_s <= self.timeout_s}
+        if now_s - self._begun_s <= self.timeout_s:
+            return heard | (self.expected - self._newest.keys())
+        return heard
 
     def next_s(self) -> float:
         """Return when :meth:`ready` should be called again at the latest, infinite when nothing waits."""
@@ -95,11 +104,12 @@ class Synchroniser:
     def _is_settled(self, one: _Open, now_s: float) -> bool:
         last_ns = one.first_ns() + self.tolerance_ns
         return all(
-            name in one.readings or self._newest[name].stamp_ns > last_ns for name in self.alive(now_s)
+            name in one.readings or (name in self._newest and self._newest[name].stamp_ns > last_ns)
+            for name in self.alive(now_s)
         )
 
     def _is_overdue(self, now_s: float) -> bool:
-        return self.next_s() <= now_s
+        return self.next_s() <= now_s or len(self._open) > self.most_open
 
     def _forget(self) -> None:
         self.jumps += 1

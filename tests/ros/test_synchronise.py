@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from headvox_ros.synchronise import Reading, Synchroniser
+from headvox.ros.synchronise import Reading, Synchroniser
 
 MS = 1_000_000
 
@@ -123,3 +123,23 @@ def test_whatever_comes_every_reading_is_given_at_most_once_and_in_order(seed):
         stamps = [t for _, t in s]
         assert max(stamps) - min(stamps) <= 20
         assert now - min(arrived[one] for one in s) <= 0.05 + 1e-9
+
+
+def test_a_sensor_that_is_expected_is_waited_for_from_the_start():
+    def first_sets(expected):
+        one = Synchroniser(20_000_000, 0.5, 2.0, frozenset(expected))
+        sets = one.add(Reading("a", 1_000_000_000, 5.0, None))
+        return sets + one.add(Reading("b", 1_001_000_000, 5.01, None)), one.late
+
+    assert [[r.sensor for r in readings] for readings in first_sets("ab")[0]] == [["a", "b"]]
+    assert first_sets("ab")[1] == 0
+    assert [[r.sensor for r in readings] for readings in first_sets("")[0]] == [["a"]]
+    silent = Synchroniser(20_000_000, 9.0, 2.0, frozenset("ab"))
+    given = [len(silent.add(Reading("a", k * 500_000_000, 0.5 * k, None))) for k in range(1, 8)]
+    assert given == [0, 0, 0, 0, 0, 6, 1]  # b never comes: after two seconds nobody waits for it
+
+
+def test_what_waits_is_bounded():
+    one = Synchroniser(20_000_000, 1e9, 1e9, frozenset("ab"), most_open=3)
+    given = [len(one.add(Reading("a", k * 50_000_000, 0.0, None))) for k in range(10)]
+    assert given == [0, 0, 0, 1, 1, 1, 1, 1, 1, 1]

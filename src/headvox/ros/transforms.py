@@ -12,6 +12,7 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -150,6 +151,15 @@ class TransformBuffer:
         T_common_target = self._along(above_target[: above_target.index(common)], stamp_ns)
         return inverse(T_common_target) @ T_common_source
 
+    def above(self, frame: str) -> list[str]:
+        """Return ``frame`` and the frames above it, up to the root.
+
+        Raises:
+            NoTransform: the transforms go round in a loop.
+        """
+        with self._changed:
+            return self._chain(_name(frame))
+
     def _is_known(self, frame: str) -> bool:
         return frame in self._edges or any(edge.parent == frame for edge in self._edges.values())
 
@@ -169,6 +179,21 @@ class TransformBuffer:
         for frame in frames:
             T = _at(frame, self._edges[frame], stamp_ns) @ T
         return T
+
+
+def set_from(buffer: TransformBuffer, message: Any, is_static: bool) -> None:
+    """Note what a tf2_msgs/TFMessage says."""
+    for stamped in message.transforms:
+        t, q = stamped.transform.translation, stamped.transform.rotation
+        stamp = stamped.header.stamp
+        buffer.set(
+            stamped.header.frame_id,
+            stamped.child_frame_id,
+            stamp.sec * NS + stamp.nanosec,
+            np.array([t.x, t.y, t.z]),
+            np.array([q.x, q.y, q.z, q.w]),
+            is_static,
+        )
 
 
 def _name(frame: str) -> str:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from headvox_ros.transforms import NoTransform, TransformBuffer
+from headvox.ros.transforms import NoTransform, TransformBuffer
 
 S = 1_000_000_000
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

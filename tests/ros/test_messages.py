@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from headvox import HeadvoxError
-from headvox_ros.messages import FIELD_TYPES, cloud_points, depth_image, intrinsics, stamp_ns
+from headvox.ros.messages import FIELD_TYPES, cloud_points, depth_image, intrinsics, stamp_ns
 
 SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8}
 CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}

@@ -75,12 +75,13 @@ def run(
     limit: int | None = None,
     on_bad: Callable[[int, str], None] | None = None,
     on_frame: Callable[[Report], None] | None = None,
+    on_result: Callable[[Frame, Result], None] | None = None,
 ) -> Report:
     """Run ``detector`` and ``tracker`` over ``source``, hand each result to every sink, and return what happened.
 
     A frame that cannot be read or used is counted, told to ``on_bad`` (its index, the reason) and skipped.
-    ``on_frame`` is called after every frame. Ctrl-C ends the run as the end of the source does, the
-    report tells. Neither source nor sinks are closed.
+    ``on_result`` gets every frame that could be used, after the sinks; ``on_frame`` is called after every frame.
+    Ctrl-C ends the run as the end of the source does, the report tells. Neither source nor sinks are closed.
 
     Args:
         tracker: without one, every frame is by itself.
@@ -112,6 +113,9 @@ def run(
                     report.untracked = tracker.untracked
                 for sink in sinks:
                     sink.write(result)
+                if on_result is not None:
+                    assert isinstance(frame, Frame)  # a bad frame has no result
+                    on_result(frame, result)
             report.seconds = time.perf_counter() - begun
             if on_frame is not None:
                 on_frame(report)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from headvox import __version__
-from headvox.cli import (
+from headvox.flags import (
     GOOD,
     LIMIT_MISSED,
     UsageError,

@@ -1,0 +1,218 @@
+"""What the commands share: their flags, the settings these stand for, and the exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from headvox.errors import HeadvoxError
+
+if TYPE_CHECKING:
+    from headvox.config import Config, DetectorConfig, TrackerConfig
+    from headvox.sources.options import SourceOptions
+
+    Commands = argparse._SubParsersAction[argparse.ArgumentParser]
+    Command = Callable[[argparse.Namespace], int]
+
+GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED = 0, 1, 2, 3, 130
+"""What a command tells the shell."""
+
+
+class UsageError(Exception):
+    """The flags do not go together."""
+
+
+def sample_folder() -> Path:
+    """Return the recording that ships with headvox."""
+    sample = Path(__file__).parent / "assets" / "sample"
+    if not sample.is_dir():
+        raise HeadvoxError("This headvox has no sample recording in it.", "Give a SOURCE: headvox run PATH.")
+    return sample
+
+
+def config_of(args: argparse.Namespace) -> DetectorConfig:
+    """Return the settings of the detector: flags beat the file, the file beats the defaults."""
+    from headvox.config import DetectorConfig, load_config
+
+    return _with_flags(DetectorConfig() if args.config is None else load_config(args.config), args)
+
+
+def tracker_config_of(args: argparse.Namespace) -> TrackerConfig:
+    """Return the settings of the tracker, in the same way."""
+    from headvox.config import TrackerConfig, load_tracker_config
+
+    return _with_flags(TrackerConfig() if args.config is None else load_tracker_config(args.config), args)
+
+
+def source_options_of(args: argparse.Namespace) -> SourceOptions:
+    """Return what the flags tell about the source."""
+    from headvox.sources.options import SourceOptions, mount
+
+    return SourceOptions(
+        topics=tuple(args.topic),
+        frame=args.frame,
+        T_world_mount=None if args.mount is None else mount(*args.mount),
+    )
+
+
+def _with_flags(config: Config, args: argparse.Namespace) -> Config:
+    from dataclasses import fields, replace
+
+    names = [field.name for field in fields(config)]
+    flags = {name: getattr(args, name) for name in names if getattr(args, name, None) is not None}
+    if "centre" in flags:
+        flags["centre"] = tuple(flags["centre"])
+    try:
+        return replace(config, **flags)
+    except HeadvoxError as error:
+        raise UsageError(error.what) from None
+
+
+def keep_input(output: Path, inputs: Sequence[str | Path | None]) -> None:
+    """Refuse to write over what is read.
+
+    Raises:
+        HeadvoxError: ``output`` is one of ``inputs``, or lies in one.
+    """
+    target = output.resolve()
+    for path in inputs:
+        if path is None or not Path(path).exists():
+            continue
+        source = Path(path).resolve()
+        same = target == source or (target.exists() and target.samefile(source))
+        if same or (source.is_dir() and source in target.parents):
+            raise HeadvoxError(
+                f"Output {output} would be written into the input {path}.", "Choose another place."
+            )
+
+
+def add_command(commands: Commands, name: str, function: Command, text: str) -> argparse.ArgumentParser:
+    """Add a command that is done by ``function``, and return its parser."""
+    parser = commands.add_parser(
+        name, help=text, description=text[0].upper() + text[1:] + ".", allow_abbrev=False
+    )
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    parser.set_defaults(command=function, parser=parser)
+    return parser
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """Add the frames to look at."""
+    parser.add_argument(
+        "source",
+        nargs="?",
+        type=Path,
+        metavar="SOURCE",
+        help="a depth recording (folder), a bag of ROS 1 or 2 (.bag, .mcap, sqlite3), a ply, pcd, npy or npz file, "
+        "or a folder of those; without it, the sample recording that ships with headvox",
+    )
+    parser.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
+    parser.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
+    add_source_options(parser)
+
+
+def add_source_options(parser: argparse.ArgumentParser) -> None:
+    """Add a flag for each thing that a bag may not tell by itself."""
+    group = parser.add_argument_group("bags", "what a bag does not tell by itself")
+    group.add_argument(
+        "--topic", action="append", default=[], metavar="NAME", help="read this topic (again for another)"
+    )
+    group.add_argument("--frame", metavar="NAME", help="frame that the heads are to be in; its z points up")
+    group.add_argument(
+        "--mount",
+        nargs=6,
+        type=number,
+        metavar=("X", "Y", "Z", "ROLL", "PITCH", "YAW"),
+        help="where that frame, or the one sensor, stands: metres and degrees; PITCH above 0 looks down",
+    )
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add a flag for each setting; without the flag, the file or the default says."""
+    group = parser.add_argument_group(
+        "settings of the detector", "flags beat --config, --config beats the defaults"
+    )
+    group.add_argument(
+        "--config", type=Path, metavar="FILE", help="settings, as `headvox config` prints them"
+    )
+    group.add_argument(
+        "--cascade", metavar="NAME|FILE", help="which masks to look with: see `headvox masks list`"
+    )
+    group.add_argument(
+        "--max-range", dest="max_range_m", type=number, metavar="M", help="drop farther points"
+    )
+    group.add_argument(
+        "--centre", nargs=3, type=number, metavar=("X", "Y", "Z"), help="what --max-range is measured from"
+    )
+    group.add_argument(
+        "--min-height", dest="min_height_m", type=number, metavar="M", help="drop lower points"
+    )
+    group.add_argument(
+        "--max-height", dest="max_height_m", type=number, metavar="M", help="drop higher points"
+    )
+    group.add_argument("--min-score", type=number, metavar="S", help="drop heads that score less")
+    group.add_argument("--voxel", dest="voxel_m", type=number, metavar="M", help="edge of a voxel")
+    group.add_argument("--refine", choices=("pose", "sphere", "none"), help="how a head is sharpened")
+    group.add_argument(
+        "--score-slack",
+        type=number,
+        metavar="S",
+        help="how much less a head may score where a tracker expects it",
+    )
+    group.add_argument(
+        "--threads", type=whole_number, metavar="N", help="threads for a frame; the heads are the same"
+    )
+
+
+def add_tracker_settings(parser: argparse.ArgumentParser) -> None:
+    """Add a flag for each setting of the tracker; :func:`add_settings` adds ``--config``."""
+    tracker = parser.add_argument_group("settings of the tracker", "the same holds")
+    for flag, name, kind, metavar, text in TRACKER_FLAGS:
+        tracker.add_argument(flag, dest=name, type=kind, metavar=metavar, help=text)
+
+
+# argparse names these three in its messages: "invalid number value: 'x'".
+
+
+def number(text: str) -> float:
+    """Return the finite number that ``text`` is."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected a finite number, got {text!r}")
+    return value
+
+
+def whole_number(text: str) -> int:
+    """Return the whole number, at least 1, that ``text`` is."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected at least 1, got {text!r}")
+    return value
+
+
+def seed_number(text: str) -> int:
+    """Return the whole number, at least 0, that ``text`` is."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected at least 0, got {text!r}")
+    return value
+
+
+TRACKER_FLAGS = (
+    ("--confirm-hits", "confirm_hits", whole_number, "N", "a new head gets an id when it was seen in N ..."),
+    ("--confirm-frames", "confirm_frames", whole_number, "N", "... of N frames in a row"),
+    ("--gate-sigmas", "gate_sigmas", number, "SIGMAS", "how far from its prediction a head is sought"),
+    ("--speed-change", "speed_change_m_s", number, "M/S", "how fast a moving head changes its velocity"),
+    ("--turn-change", "turn_change_deg_s", number, "DEG/S", "how fast a head changes its turn rate"),
+    ("--empty", "empty_s", number, "S", "a track ends when its place is seen to be empty for so long"),
+    ("--out-of-view", "out_of_view_s", number, "S", "... or is out of every sensor's view"),
+    ("--missed", "missed_s", number, "S", "... or is in view, but nothing is found there"),
+    ("--weak", "weak_s", number, "S", "... or only what scores too little to be a head by itself"),
+    ("--hidden", "hidden_s", number, "S", "... or is hidden behind something"),
+    ("--remember", "remember_s", number, "S", "how long a head that was lost is the same when it comes back"),
+    ("--sight", "sight_m", number, "M", "how far the sensors see"),
+    ("--reset", "reset_s", number, "S", "a jump back in time by more than this begins anew"),
+)

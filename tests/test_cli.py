@@ -210,7 +210,7 @@ def test_output_files_hold_what_json_prints(recording: Path, anything: Path, tmp
 def test_an_unknown_kind_of_output_is_wrong_usage(recording: Path, tmp_path: Path) -> None:
     done = headvox("run", recording, "-o", tmp_path / "out.txt")
     assert done.returncode == 2
-    assert ".jsonl, .csv or .tum" in done.stderr
+    assert ".jsonl, .csv, .tum or .mcap" in done.stderr
     assert not (tmp_path / "out.txt").exists()
 
 

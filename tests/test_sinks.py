@@ -82,7 +82,7 @@ def test_a_stream_is_not_closed() -> None:
 
 
 def test_files_that_cannot_be_written_are_explained(tmp_path: Path) -> None:
-    with pytest.raises(HeadvoxError, match=r"\.jsonl, \.csv or \.tum"):
+    with pytest.raises(HeadvoxError, match=r"\.jsonl, \.csv, \.tum or \.mcap"):
         open_sink(tmp_path / "out.txt")
     with pytest.raises(HeadvoxError, match="No such file"):
         open_sink(tmp_path / "nowhere" / "out.csv")

@@ -148,19 +148,49 @@ def _run(args: argparse.Namespace) -> int:
     from headvox.sinks import Sink, open_sink
     from headvox.sinks.jsonl import JsonStream
     from headvox.sinks.summary import summary
+    from headvox.sources.bag import BagSource
 
     with opened(args, track=not args.no_track) as session, ExitStack() as stack:
         sinks: list[Sink] = []
         if args.output is not None:
+            source = session.source
+            frame = source.frame if isinstance(source, BagSource) else "world"
             # Before the stream: what was printed is in the file, however the run ends.
             keep_input(args.output, session.inputs)
-            sinks.append(stack.enter_context(closing(open_sink(args.output))))
+            sinks.append(stack.enter_context(closing(open_sink(args.output, frame))))
         if args.json:
             sinks.append(JsonStream(sys.stdout))
         report = session.run(sinks)
     if not args.json:
         print(summary(report))
     return INTERRUPTED if report.interrupted else GOOD
+
+
+def _convert(args: argparse.Namespace) -> int:
+    from headvox.convert import convert
+    from headvox.live import Live
+    from headvox.sources import open_source
+
+    notes: list[str] = []
+    with closing(open_source(args.source, source_options_of(args), notes.append)) as source:
+        keep_input(args.output, [args.source])
+        with closing(Live(sys.stderr, source.length)) as live:
+            for note in notes:
+                live.note(f"headvox: {note}")
+            done, bad = convert(source, args.output, lambda k: live.show(f"frame {k}"))
+    size = f"{args.output.stat().st_size / 1e6:.1f} MB"
+    print(
+        table(
+            [],
+            [
+                ["file", str(args.output)],
+                ["frames", str(done - bad)],
+                ["bad frames", str(bad)],
+                ["size", size],
+            ],
+        )
+    )
+    return GOOD
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -243,6 +273,20 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
     add_source_options(info)
 
+    conversion = add_command(
+        commands, "convert", _convert, "write a recording, or any source, as a bag (MCAP)"
+    )
+    conversion.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
+    conversion.add_argument(
+        "-o",
+        dest="output",
+        type=bag_file,
+        required=True,
+        metavar="OUT.mcap",
+        help="messages of ROS 2, without ROS",
+    )
+    add_source_options(conversion)
+
     config = add_command(
         commands, "config", _show_config, "print the settings as TOML, as --config takes them"
     )
@@ -263,6 +307,14 @@ def output_file(text: str) -> Path:
     path = Path(text)
     if path.suffix not in SUFFIXES:
         raise argparse.ArgumentTypeError(f"expected a name that ends with {_either(SUFFIXES)}, got {text!r}")
+    return path
+
+
+def bag_file(text: str) -> Path:
+    """Return the path of a bag that can be written."""
+    path = Path(text)
+    if path.suffix != ".mcap":
+        raise argparse.ArgumentTypeError(f"expected a name that ends with .mcap, got {text!r}")
     return path
 
 

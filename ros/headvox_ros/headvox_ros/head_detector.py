@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +11,6 @@ from typing import Any
 from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
@@ -18,10 +19,10 @@ from headvox.data import Frame
 from headvox.errors import HeadvoxError
 from headvox.masks import load_cascade
 from headvox.pipeline import Detector
-from headvox.ros.synchronise import NS
+from headvox.ros import outputs
 from headvox.track import Tracker
 from headvox.warmup import warm_up
-from headvox_ros import outputs
+from headvox_ros.as_message import as_message
 from headvox_ros.node import SensorNode, run
 from headvox_ros.parameters import Parameter, config_from, parameters_of
 
@@ -36,6 +37,11 @@ PARAMETERS = [
 ]
 
 
+vision: Any = None
+with contextlib.suppress(ImportError):  # a ROS without vision_msgs: the topic is left out
+    vision = importlib.import_module("vision_msgs.msg")
+
+
 class HeadDetector(SensorNode):
     """Finds heads in what depth cameras and LiDARs see, in process: no cloud leaves it."""
 
@@ -48,8 +54,8 @@ class HeadDetector(SensorNode):
         self._markers = self.create_lifecycle_publisher(MarkerArray, "~/markers", qos)
         self._tracks = self.create_lifecycle_publisher(Odometry, "~/tracks", QoSProfile(depth=50))
         self._heads = None
-        if outputs.vision is not None:
-            self._heads = self.create_lifecycle_publisher(outputs.vision.Detection3DArray, "~/heads", qos)
+        if vision is not None:
+            self._heads = self.create_lifecycle_publisher(vision.Detection3DArray, "~/heads", qos)
         self._tf = self.create_lifecycle_publisher(TFMessage, "/tf", QoSProfile(depth=100))
 
     def check(self, values: Mapping[str, Any]) -> None:
@@ -76,16 +82,15 @@ class HeadDetector(SensorNode):
         self._heed_parameters()
         heads = self._look(frame)
         seen = [head for head in heads if head.is_seen]
-        header = Header(frame_id=self.get_parameter("target_frame").value)
-        header.stamp.sec, header.stamp.nanosec = divmod(frame.stamp_ns, NS)
+        header = outputs.header_of(frame.stamp_ns, self.get_parameter("target_frame").value)
         if self._heads is not None:
-            self._heads.publish(outputs.detections(header, seen))
-        self._poses.publish(outputs.poses(header, seen))
-        self._markers.publish(self._board.show(header, heads))
+            self._heads.publish(as_message(vision.Detection3DArray, outputs.detections(header, seen)))
+        self._poses.publish(as_message(PoseArray, outputs.poses(header, seen)))
+        self._markers.publish(as_message(MarkerArray, self._board.show(header, heads)))
         for track in outputs.tracks(header, heads):
-            self._tracks.publish(track)
+            self._tracks.publish(as_message(Odometry, track))
         if self.get_parameter("publish_tf").value:
-            self._tf.publish(TFMessage(transforms=outputs.frames(header, heads)))
+            self._tf.publish(as_message(TFMessage, outputs.frames(header, heads)))
 
     def _look(self, frame: Frame) -> list[outputs.HeadNow]:
         assert self._detector is not None

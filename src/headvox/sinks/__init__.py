@@ -18,7 +18,7 @@ from headvox.errors import HeadvoxError
 if TYPE_CHECKING:
     from headvox.data import Heads, Track, Tracks
 
-SUFFIXES = (".jsonl", ".csv", ".tum")
+SUFFIXES = (".jsonl", ".csv", ".tum", ".mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,10 @@ class Sink(Protocol):
         ...
 
 
-def open_sink(path: Path) -> Sink:
+def open_sink(path: Path, frame: str = "world") -> Sink:
     """Return a sink that writes ``path``, of the kind that its suffix says; an older file is replaced.
+
+    ``frame`` is what ROS calls the world that the heads are in.
 
     Raises:
         HeadvoxError: an unknown suffix, or a file that cannot be made.
@@ -77,6 +79,10 @@ def open_sink(path: Path) -> Sink:
         from headvox.sinks.tum import TumFiles
 
         return TumFiles(path)
+    if path.suffix == ".mcap":
+        from headvox.sinks.mcapfile import McapSink
+
+        return McapSink(path, frame)
     raise HeadvoxError(
         f"Output {path}: expected a name that ends with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}.",
         "Rename it.",

@@ -77,6 +77,14 @@ class BagSource:
         self._damage: HeadvoxError | None = None
         self._open = True
 
+    @property
+    def frame(self) -> str:
+        """What ROS calls the world that the heads are in."""
+        placing = self.placing
+        if placing.T_world_frame is not None or placing.T_world_sensor is not None:
+            return "world"  # that of --mount, which the bag has no name for
+        return placing.frame or self.sensors[0].frame
+
     def _first_stamps(self) -> dict[str, int]:
         return {s.topic: stamp_ns(self.bag.first(s.topic).header.stamp) for s in self.sensors}
 

@@ -1,0 +1,154 @@
+"""Writes ROS 2 messages to an MCAP file without ROS; their definitions are in it, so that any viewer reads them."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from headvox.errors import HeadvoxError
+from headvox.ros.bagfile import INSTALL
+from headvox.ros.outputs import Content
+
+CHUNK_BYTES = 256 << 10  # what is lost at most when the process is killed
+# vision_msgs is in no distribution's common messages: these are its definitions in ROS 2 Humble and later.
+_VISION = {
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox3D bbox\nstring id",
+    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+
+
+class McapFile:
+    """An MCAP file that grows; closed by :meth:`close`, or by Ctrl-C through it, it is whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the file; an older one is replaced.
+
+        Raises:
+            HeadvoxError: a package is missing, or the file cannot be made.
+        """
+        try:
+            from mcap.writer import CompressionType, Writer
+            from rosbags import typesys
+        except ImportError as error:
+            name = (error.name or "mcap").partition(".")[0]
+            raise HeadvoxError(f"MCAP files need the package {name!r}.", f"Run: {INSTALL}") from None
+        self.path = path
+        self._store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        for name, definition in _VISION.items():
+            self._store.register(typesys.get_types_from_msg(definition, f"vision_msgs/msg/{name}"))
+        self._topics: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        try:
+            self._file = path.open("wb")
+            self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            self._writer.start("ros2")
+        except OSError as error:
+            raise HeadvoxError(f"Output {path}: {error.strerror or error}.", "Check the path.") from None
+        self._open = True
+
+    def write(self, topic: str, kind: str, stamp_ns: int, content: Content) -> None:
+        """Write a message of a type such as ``geometry_msgs/msg/PoseArray``, recorded at its own stamp.
+
+        Raises:
+            HeadvoxError: the disk is full.
+        """
+        message = message_of(self._store, kind, content)
+        data = bytes(self._store.serialize_cdr(message, kind))
+        with self._whole():
+            if topic not in self._topics:
+                self._topics[topic] = self._writer.register_channel(topic, "cdr", self._schema(kind))
+            self._writer.add_message(self._topics[topic], stamp_ns, data, stamp_ns)
+
+    def _schema(self, kind: str) -> int:
+        if kind not in self._schemas:
+            definition, _ = self._store.generate_msgdef(kind, ros_version=2)
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
+        return self._schemas[kind]
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        if not self._open:
+            return
+        self._open = False
+        finish: Callable[[], None] = self._writer.finish
+        with self._whole():
+            finish()
+        self._file.close()
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """Let nothing come between: half a record would spoil the file."""
+        try:
+            with uninterrupted():
+                yield
+                self._file.flush()
+        except OSError as error:
+            self._open = False
+            with suppress(OSError):
+                self._file.close()
+            raise HeadvoxError(
+                f"Output {self.path}: {error.strerror or error}.",
+                "What was written before is got back with: mcap recover",
+            ) from None
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back until the block is done; it comes to the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[tuple[int, Any]] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if held and callable(before):
+            before(*held[0])
+
+
+def message_of(store: Any, kind: str, content: Content) -> Any:
+    """Return a message of rosbags with these fields; others are zero or empty.
+
+    Raises:
+        KeyError: the type has no field of that name.
+    """
+    fields = dict(store.fielddefs[kind][1])
+    values = {name: _zero(store, description) for name, description in fields.items() if name not in content}
+    values |= {name: _value(store, fields[name], value) for name, value in content.items()}
+    return store.types[kind](**values)
+
+
+def _zero(store: Any, description: tuple[Any, Any]) -> Any:
+    node, detail = description
+    if node.name == "BASE":
+        return "" if detail[0] == "string" else np.zeros((), detail[0]).item()
+    if node.name == "NAME":
+        return message_of(store, detail, {})
+    (element, inner), size = detail
+    return [] if element.name == "NAME" or inner[0] == "string" else np.zeros(size, inner[0])
+
+
+def _value(store: Any, description: tuple[Any, Any], value: Any) -> Any:
+    node, detail = description
+    if node.name == "BASE":
+        return value
+    if node.name == "NAME":
+        return message_of(store, detail, value)
+    (element, inner), _ = detail
+    return (
+        [message_of(store, inner, one) for one in value]
+        if element.name == "NAME"
+        else np.asarray(value, inner[0])
+    )

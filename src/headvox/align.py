@@ -31,7 +31,8 @@ COST, ON_SURFACE, CROSSED, EVIDENCE = 0, 1, 2, 3  # what is told of a fit
 TOLD = 4
 
 COARSE_STEPS, FINE_STEPS = 4, 5
-COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 120, 200, 160
+COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 100, 200, 160  # the coarse ones are half of the fine ones
+HALF_STEPS = 3  # of the fine steps look at half of the points and rays
 COARSE_MODES = 3
 COARSE_K, FINE_K, LAST_K = (
     6.0,
@@ -96,10 +97,15 @@ class Scratch(NamedTuple):
 
 @rule
 def choose(source, there, target, most):  # type: ignore[no-untyped-def]
-    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many."""
+    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many.
+
+    Every second one comes first: the first half of them is spread as evenly as all are.
+    """
     used = min(there, most)
+    half = (used + 1) // 2
     for s in range(used):
-        at = (2 * s + 1) * there // (2 * used)
+        rank = 2 * s if s < half else 2 * (s - half) + 1
+        at = (2 * rank + 1) * there // (2 * used)
         for j in range(source.shape[1]):
             target[s, j] = source[at, j]
     return used
@@ -329,38 +335,72 @@ def _move(state, x, size):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
+def explore(work, used, starts, upright, template):  # type: ignore[no-untyped-def]
+    """Take a few steps from each of ``starts`` (S, 9), on some of the ``used`` points and no rays.
+
+    States and costs are left in ``work``.
+    """
+    A, x, modes, rays = work.A, work.x, np.int64(COARSE_MODES), np.int64(0)
+    used = min(used, COARSE_SAMPLES)
+    for i in range(starts.shape[0]):
+        state = work.coarse[i]
+        for step in range(COARSE_STEPS + 1):
+            k, steps = COARSE_K - min(step, COARSE_STEPS - 1), step < COARSE_STEPS
+            work.costs[i] = linearise(
+                work.points, used, work.passing, rays, modes, k, upright, steps, template.rows, template.low,
+                template.voxel_m, state, work.J, A, work.told[MOST_REFINED],
+            )  # fmt: skip
+            if steps:
+                solve(A, x, 7 + modes)
+                _move(state, x, 7 + modes)
+
+
+@bare_kernel
+def refine(work, used, rays, upright, template, at):  # type: ignore[no-untyped-def]
+    """Take the steps of all modes from the state ``at`` of ``work.fine``.
+
+    The first of them look at every second of the ``used`` points and ``rays`` only. What the last state costs, and its
+    covariance, are left in ``work``.
+    """
+    A, x, state, told = work.A, work.x, work.fine[at], work.told[at]
+    modes, always = np.int64(MODES), np.bool_(True)  # constants would make Numba compile linearise for each
+    for step in range(FINE_STEPS + 1):
+        k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
+        n, m = (used + 1) // 2, (rays + 1) // 2
+        if step >= HALF_STEPS:
+            n, m = used, rays
+        cost = linearise(
+            work.points, n, work.passing, m, modes, k, upright, always, template.rows, template.low, template.voxel_m,
+            state, work.J, A, told,
+        )  # fmt: skip
+        told[EVIDENCE] = cost + solve(A, x, 7 + modes)
+        if step < FINE_STEPS:
+            _move(state, x, 7 + modes)
+    _invert(A, x, work.covariances[at])
+
+
+@bare_kernel
 def align(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def]
     """Try all ``starts`` (S, 9) on the ``n`` samples and ``m`` rays of ``work``, and refine the best.
 
     ``work`` is a :class:`Scratch`, ``template`` a :class:`~headvox.template.Template`. Returned is how many were
     refined; ``work`` has their states, what they cost and their covariances. A single start is refined at once.
     """
-    rows, low, voxel_m = template.rows, template.low, template.voxel_m
-    points, passing, J, A, x = work.points, work.passing, work.J, work.A, work.x
-    coarse, fine, told, costs = work.coarse, work.fine, work.told, work.costs
-    count = starts.shape[0]
+    coarse, fine, costs, count = work.coarse, work.fine, work.costs, starts.shape[0]
+    used, rays = (
+        choose(work.samples, n, work.points, FINE_SAMPLES),
+        choose(work.rays, m, work.passing, FINE_RAYS),
+    )
+    for i in range(count):
+        costs[i] = 0.0
+        for j in range(STATE):
+            coarse[i, j] = starts[i, j - 3] if 3 <= j < 12 else 0.0
     if count > 1:
-        used = choose(work.samples, n, points, COARSE_SAMPLES)
-        size = 7 + COARSE_MODES
+        explore(work, used, starts, upright, template)
     least = np.inf
     for i in range(count):
-        state = coarse[i]
-        for j in range(STATE):
-            state[j] = starts[i, j - 3] if 3 <= j < 12 else 0.0
-        costs[i] = 0.0
-        if count > 1:
-            for step in range(COARSE_STEPS + 1):
-                k, steps = COARSE_K - min(step, COARSE_STEPS - 1), step < COARSE_STEPS
-                costs[i] = linearise(
-                    points, used, passing, 0, COARSE_MODES, k, upright, steps, rows, low, voxel_m, state, J, A,
-                    told[MOST_REFINED],
-                )  # fmt: skip
-                if steps:
-                    solve(A, x, size)
-                    _move(state, x, size)
         least = min(least, costs[i])
-    used, rays = choose(work.samples, n, points, FINE_SAMPLES), choose(work.rays, m, passing, FINE_RAYS)
-    refined = 0
+    refined = np.int64(0)
     while refined < MOST_REFINED:
         best = 0
         for i in range(count):
@@ -377,31 +417,8 @@ def align(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def
             known = known or trace > ALIKE
         if known:
             continue
-        state = fine[refined]
         for j in range(STATE):
-            state[j] = coarse[best, j]
-        for step in range(FINE_STEPS + 1):
-            k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
-            cost = linearise(
-                points,
-                used,
-                passing,
-                rays,
-                MODES,
-                k,
-                upright,
-                True,
-                rows,
-                low,
-                voxel_m,
-                state,
-                J,
-                A,
-                told[refined],
-            )
-            told[refined, EVIDENCE] = cost + solve(A, x, PARAMETERS)
-            if step < FINE_STEPS:
-                _move(state, x, PARAMETERS)
-        _invert(A, x, work.covariances[refined])
+            fine[refined, j] = coarse[best, j]
+        refine(work, used, rays, upright, template, refined)
         refined += 1
     return refined

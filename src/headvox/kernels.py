@@ -20,6 +20,7 @@ from typing import Any
 from weakref import finalize
 
 import numba
+import numpy as np
 import numpy.typing as npt
 
 
@@ -66,12 +67,12 @@ def rule(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return a view of ``array`` that cannot be written to.
+    """Return a view of ``array`` (a C-contiguous copy, if it is not) that cannot be written to.
 
     Numba compiles a loop anew for arrays that must not be written, such as lie in a file or in a camera's buffer.
     Whatever comes from outside goes through this, so each loop is compiled once.
     """
-    view = array.view()
+    view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
     return view
 

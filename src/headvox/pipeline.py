@@ -20,7 +20,7 @@ from headvox.frames import as_rigid
 from headvox.fuse import Region
 from headvox.gate import candidate_reach, gate_columns, gate_tables, list_passed, shape_of_passed
 from headvox.integral import box_reach, integrate, set_corners, shape_with_margins
-from headvox.kernels import Threads
+from headvox.kernels import Threads, read_only
 from headvox.masks import SCORE_UNIT, CompiledStages, compile_cascade, load_cascade
 from headvox.pose import fit_poses
 from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
@@ -142,10 +142,11 @@ class Detector:
         def mark(part: int) -> None:
             cells, marking, box = memory.flat[part], memory.marking[part], boxes[part]
             for cloud in frame.clouds:
-                low, high = _share(len(cloud.points), part, parts)
+                points = read_only(cloud.points)
+                low, high = _share(len(points), part, parts)
                 T = part_transform(cloud, lattice)
                 mark_points(
-                    cloud.points[low:high],
+                    points[low:high],
                     T,
                     limits,
                     shape,
@@ -156,7 +157,7 @@ class Detector:
                     cells,
                 )
             for image in frame.depths:
-                rays, depth = self._rays_of(image, lattice), np.ascontiguousarray(image.depth)
+                rays, depth = self._rays_of(image, lattice), read_only(image.depth)
                 low, high = _share(depth.shape[0], part, parts)
                 mark_depth(
                     depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting,
@@ -305,7 +306,8 @@ class Detector:
         states = np.zeros((len(cells), len(judge.offsets)), np.uint8)
         in_lattice = cells + memory.first.astype(np.int32)
         for image in frame.depths:
-            look_about(image.depth, camera_table(image, memory.lattice), in_lattice, judge.offsets, states)
+            table = camera_table(image, memory.lattice)
+            look_about(read_only(image.depth), table, in_lattice, judge.offsets, states)
         seen = np.empty((len(cells), len(judge.offset_start) - 1, 2), np.int32)
         count_states(states, judge.offset_start, seen)
         scores = np.empty(len(cells), np.int64)

@@ -26,20 +26,23 @@ def fit_head(work, n, m, centre, expected, upright, anyhow, template, poses, i):
         return 0, 0
     used = min(n, FINE_SAMPLES)
     refined = 0
-    if np.isfinite(expected.sum()):
-        refined = align(work, n, m, expected.reshape(1, 9), True, template)
-        if work.told[0, COST] > POOR * used:
-            refined = 0
-    if refined == 0:
-        if is_round(work.samples, n):
-            refined = align(work, n, m, anyhow, False, template)
-        else:
-            refined = align(work, n, m, upright, True, template)
-    best = 0
+    knows = True
+    for j in range(9):
+        knows = knows and np.isfinite(expected[j])
+    for alone in (True, False):  # from what is expected alone, then from everywhere
+        stands, starts = True, expected.reshape(1, 9)
+        if not alone:
+            stands = not is_round(work.samples, n)
+            starts = upright if stands else anyhow
+        if knows or not alone:
+            refined = align(work, n, m, starts, stands, template)
+            if work.told[0, COST] <= POOR * used:
+                break
+    best = np.int64(0)
     for s in range(1, refined):
         if work.told[s, EVIDENCE] < work.told[best, EVIDENCE]:
-            best = s
-    if np.isfinite(work.fine[best].sum()):
+            best = s  # type: ignore[assignment]
+    if refined > 0 and np.isfinite(work.told[best, EVIDENCE]):
         poses.misfits[i] = work.told[best, COST] / used
         poses.coverages[i] = work.told[best, ON_SURFACE] / used
         poses.crossings[i] = work.told[best, CROSSED] / max(min(m, FINE_RAYS), 1)

@@ -8,6 +8,9 @@ later where it is hidden.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -200,11 +203,10 @@ class Tracker:
 
     def _correct(self, heads: Heads, R_centre: F64, R_turn: F64, tracks: I64, found: I64) -> None:
         table = self._table
-        correct_places(table["x"], table["P"], table["weight"], tracks, found, heads.centres, R_centre)
-        correct_turns(
-            table["q"], table["rate"], table["C"], table["rejected"], tracks, found, heads.quaternions, R_turn,
-            TURN_GATE,
-        )  # fmt: skip
+        with _in_one_piece(table, "x", "P", "weight") as columns:
+            correct_places(*columns, tracks, found, heads.centres, R_centre)
+        with _in_one_piece(table, "q", "rate", "C", "rejected") as columns:
+            correct_turns(*columns, tracks, found, heads.quaternions, R_turn, TURN_GATE)
         table["seen_ns"][tracks] = self._now()
         table["radius"][tracks] = heads.radii[found]
         table["score"][tracks] = heads.scores[found]
@@ -310,8 +312,10 @@ class Tracker:
         config = self.config
         density = (config.speed_change_m_s * UPRIGHT) ** 2
         turn_density = np.full(3, np.radians(config.turn_change_deg_s) ** 2)
-        predict_places(table["x"], table["P"], table["weight"], dt, STILL_S, MOVING_S, WANDER_M2_S, density)
-        predict_turns(table["q"], table["rate"], table["C"], dt, turn_density)
+        with _in_one_piece(table, "x", "P", "weight") as columns:
+            predict_places(*columns, dt, STILL_S, MOVING_S, WANDER_M2_S, density)
+        with _in_one_piece(table, "q", "rate", "C") as columns:
+            predict_turns(*columns, dt, turn_density)
 
     def _predicted(self, rows: npt.NDArray[np.bool_], stamp_ns: int) -> Table:
         table = self._table[rows]
@@ -340,8 +344,21 @@ class Tracker:
 def _combined(table: Table) -> tuple[F64, F64]:
     """Return mean (N, 6) and covariance (N, 6, 6) of position and velocity."""
     mean, cov = np.empty((len(table), 6)), np.empty((len(table), 6, 6))
-    combine(table["x"], table["P"], table["weight"], mean, cov)
+    with _in_one_piece(table, "x", "P", "weight") as columns:
+        combine(*columns, mean, cov)
     return mean, cov
+
+
+@contextmanager
+def _in_one_piece(table: Table, *names: str) -> Iterator[list[npt.NDArray[Any]]]:
+    """Lend columns of ``table`` as contiguous arrays, and put back what was written to them.
+
+    The column of a table with one row is contiguous, that of a longer one is not: the loops would be compiled for both.
+    """
+    columns = [np.ascontiguousarray(table[name]) for name in names]
+    yield columns
+    for name, column in zip(names, columns, strict=True):
+        table[name] = column
 
 
 def _widest(cov: F64) -> F64:

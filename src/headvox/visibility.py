@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from headvox.data import F32, F64, DepthImage, Intrinsics
 from headvox.frames import inverse
-from headvox.kernels import kernel, rule
+from headvox.kernels import kernel, read_only, rule
 from headvox.voxelize import Lattice
 
 HIDDEN, EMPTY = 1, 2
@@ -140,11 +140,12 @@ def see_places(images: Sequence[DepthImage], places: F64, sight_m: float) -> npt
     A camera sees ``sight_m`` far along its axis. A place that any camera saw to be empty is empty; one that is hidden
     from all that look that way is BEHIND.
     """
-    states = np.full(len(places), OUT_OF_VIEW, np.int64)
+    places, states = np.ascontiguousarray(places), np.full(len(places), OUT_OF_VIEW, np.int64)
     for image in images:
         lens = image.intrinsics
         camera = projection(lens) @ inverse(image.T_world_camera)[:3]
-        look_at_places(image.depth, camera, lens.fx, lens.fy, lens.depth_scale, places, sight_m, states)
+        depth = read_only(image.depth)
+        look_at_places(depth, camera, lens.fx, lens.fy, lens.depth_scale, places, sight_m, states)
     return states
 
 
@@ -184,7 +185,7 @@ def count_seen(images: tuple[DepthImage, ...], lattice: Lattice, cells: I32, box
     offsets, start = cells_of(boxes)
     states = np.zeros((len(cells), len(offsets)), np.uint8)
     for image in images:
-        look_about(image.depth, camera_table(image, lattice), cells, offsets, states)
+        look_about(read_only(image.depth), camera_table(image, lattice), cells, offsets, states)
     seen = np.empty((len(cells), len(boxes), 2), np.int32)
     count_states(states, start, seen)
     return seen

@@ -9,7 +9,7 @@ from test_gate import random_cells
 from headvox.integral import integral_volume
 from headvox.masks import Stage, compile_cascade, load_cascade, parse_cascade, shipped_cascades
 from headvox.simd import LANES
-from headvox.vote import DROPPED, _statistics, score_by_stages, score_by_votes, seen_boxes
+from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes, statistics_of
 
 SMALL = parse_cascade(scenes.STAGES, "small")
 SMALL_VOTES = parse_cascade(scenes.VOTES, "small votes")
@@ -143,7 +143,7 @@ def test_statistics_are_those_of_the_sorted_sums(count, dtype):
     sums = np.random.default_rng(count).integers(0, 20, (64, LANES)).astype(dtype)
     features = np.full((7, LANES), -1, dtype)
     wanted = np.sort(sums[:count], axis=0)
-    _statistics(sums.reshape(-1), count, count > 1, features.reshape(-1), LANES)
+    statistics_of(sums.reshape(-1), count, count > 1, features.reshape(-1), LANES)
     np.testing.assert_array_equal(features[5], wanted.sum(axis=0))
     if count > 1:
         np.testing.assert_array_equal(features[1:5], wanted[[0, 2, count - 3, count - 1]])

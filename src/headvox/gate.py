@@ -22,7 +22,7 @@ EVEN, ALL = np.uint32(0x55555555), np.uint32(0xFFFFFFFF)
 
 
 @rule
-def _sums(flat, at, corners, b):  # type: ignore[no-untyped-def]
+def box_sums_at(flat, at, corners, b):  # type: ignore[no-untyped-def]
     """Return the sums over box ``b`` about :data:`LANES` voxels, one above the other."""
     high = sub(load(flat, at + corners[b, 0]), load(flat, at + corners[b, 1]))
     high = sub(high, sub(load(flat, at + corners[b, 2]), load(flat, at + corners[b, 3])))
@@ -31,20 +31,20 @@ def _sums(flat, at, corners, b):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def _holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[no-untyped-def]
+def holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[no-untyped-def]
     """Return a bit for each of :data:`LANES` voxels: whether condition ``i``'s statistic lies within its limits."""
     # Unsigned, because a signed index costs a check for counting from the end.
     begin, end = np.uint64(spans[i, 0]), np.uint64(spans[i, 1])
     if rank[i] == 0:
-        total = times(_sums(flat, at, corners, begin), weights[begin])
+        total = times(box_sums_at(flat, at, corners, begin), weights[begin])
         for b in range(begin + np.uint64(1), end):
-            total = add(total, times(_sums(flat, at, corners, b), weights[b]))
+            total = add(total, times(box_sums_at(flat, at, corners, b), weights[b]))
         return within(total, limits[i, 0], limits[i, 1])
     # The kth smallest is no less than the lower limit where fewer than k are less than it; likewise from above.
     low, high = fill(limits[i, 0]), fill(limits[i, 1])
     below = above = sub(low, low)
     for b in range(begin, end):
-        total = _sums(flat, at, corners, b)
+        total = box_sums_at(flat, at, corners, b)
         below = add(below, less(total, low))
         above = add(above, less(high, total))
     return within(below, 0, rank[i] - 1) & within(above, 0, end - begin - np.uint64(rank[i]))
@@ -81,7 +81,7 @@ def gate_columns(  # type: ignore[no-untyped-def]
                     for i in range(np.uint64(rank.shape[0])):
                         if alive == 0:
                             break
-                        alive &= _holds(flat, column + z, corners, weights, spans, rank, limits, i)
+                        alive &= holds(flat, column + z, corners, weights, spans, rank, limits, i)
                     passed[x - x0, y - y0, k] = alive
 
 

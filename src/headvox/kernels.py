@@ -77,6 +77,16 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return view
 
 
+@rule
+def product(a, b):  # type: ignore[no-untyped-def]
+    """Return a * b, rounded, of two floating-point numbers whose product is added to something.
+
+    It has a name because a compiler for GPUs would make a * b + c one operation that rounds once: there, and only
+    there, another function stands for it (see :mod:`headvox.cuda.lanes`), and the bits are the same everywhere.
+    """
+    return a * b
+
+
 class Threads:
     """A fixed number of threads that run one call each; with one thread it runs in the caller and costs nothing."""
 

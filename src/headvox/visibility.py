@@ -8,6 +8,7 @@ need no volume of their own.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy.typing as npt
 
 from headvox.data import F32, F64, DepthImage, Intrinsics
 from headvox.frames import inverse
-from headvox.kernels import kernel, read_only, rule
+from headvox.kernels import kernel, product, read_only, rule
 from headvox.voxelize import Lattice
 
 HIDDEN, EMPTY = 1, 2
@@ -31,32 +32,49 @@ I32 = npt.NDArray[np.int32]
 
 
 @rule
-def look(depth, camera, x, y, z):  # type: ignore[no-untyped-def]
-    """Return EMPTY, HIDDEN or 0 for the centre of the cell x, y, z, as this camera saw it.
+def project(camera, row, x, y, z):  # type: ignore[no-untyped-def]
+    """Return what ``row`` of a camera's table gives for a place."""
+    first = product(camera[row, 0], x) + product(camera[row, 1], y)
+    return first + product(camera[row, 2], z) + camera[row, 3]
+
+
+@rule
+def pixel_of(camera, x, y, z):  # type: ignore[no-untyped-def]
+    """Return column and row that see the centre of the cell x, y, z, and how far away it is (m): -1 if too near.
 
     ``camera`` is (4, 4) float32: rows that give u·Z, v·Z and Z (m) of a cell, and a row with the depth scale, the
     constant and the quadratic part of the margin. The margin is 3 cm + 0.4 cm per m², twice a sensor's noise.
     """
-    far = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z + camera[2, 3]
+    far = project(camera, 2, x, y, z)
     if not far > np.float32(NEAREST_M):
-        return 0
-    u = (camera[0, 0] * x + camera[0, 1] * y + camera[0, 2] * z + camera[0, 3]) / far
-    v = (camera[1, 0] * x + camera[1, 1] * y + camera[1, 2] * z + camera[1, 3]) / far
+        return -1, -1, far
     half = np.float32(0.5)
-    column = int(np.floor(u + half))
-    row = int(np.floor(v + half))
-    if column < 0 or row < 0 or column >= depth.shape[1] or row >= depth.shape[0]:
-        return 0
-    raw = depth[row, column]
+    column = int(math.floor(project(camera, 0, x, y, z) / far + half))
+    row = int(math.floor(project(camera, 1, x, y, z) / far + half))
+    return column, row, far
+
+
+@rule
+def state_at(raw, camera, far):  # type: ignore[no-untyped-def]
+    """Return EMPTY, HIDDEN or 0 for a cell so ``far`` away whose pixel measured ``raw``."""
     if raw == 0:
         return 0
     measured = np.float32(raw) * camera[3, 0]
-    margin = camera[3, 1] + camera[3, 2] * far * far
+    margin = camera[3, 1] + product(camera[3, 2] * far, far)
     if measured > far + margin:
         return 2
     if measured < far - margin:
         return 1
     return 0
+
+
+@rule
+def look(depth, camera, x, y, z):  # type: ignore[no-untyped-def]
+    """Return EMPTY, HIDDEN or 0 for the centre of the cell x, y, z, as this camera saw it."""
+    column, row, far = pixel_of(camera, x, y, z)
+    if column < 0 or row < 0 or column >= depth.shape[1] or row >= depth.shape[0]:
+        return 0
+    return state_at(depth[row, column], camera, far)
 
 
 @kernel

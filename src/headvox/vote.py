@@ -9,6 +9,7 @@ integers; after each stage a candidate below the stage's threshold is dropped, s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.integral import Integral, box_reach, box_sum, set_corners, with_margins
-from headvox.kernels import bare_kernel, kernel, rule
+from headvox.kernels import bare_kernel, kernel, product, rule
 from headvox.masks import SCORE_UNIT, STATISTICS, CompiledStages, CompiledVotes
 from headvox.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
 
@@ -39,36 +40,45 @@ def sum_about(S, x, y, z, box):  # type: ignore[no-untyped-def]
 # ------------------------------------------------------------------------------------------------ the paper's
 
 
+@rule
+def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes):  # type: ignore[no-untyped-def]
+    """Return the score of the voxel x, y, z, and its best yaw or -1: see :func:`score_by_votes`."""
+    best = -np.inf
+    best_yaw = -1
+    for yaw in range(pairs.shape[0]):
+        votes = 0
+        score = 0.0
+        for m in range(yaw * masks, (yaw + 1) * masks):
+            total = np.int64(0)
+            for b in range(start[m], start[m + 1]):
+                total += weights[b] * sum_about(S, x, y, z, boxes[b])
+            if total > 0:
+                votes += 1
+                score += 1.0
+            elif total < 0:
+                score -= 1.0
+        unlike = 0.0
+        for p in range(pairs.shape[1]):
+            one = sum_about(S, x, y, z, pairs[yaw, p, 0])
+            other = sum_about(S, x, y, z, pairs[yaw, p, 1])
+            if one + other > 0:
+                unlike += abs(one - other) / (one + other)
+        if pairs.shape[1] > 0:
+            score -= product(cost, unlike / pairs.shape[1])
+        if votes >= min_votes and score > best:
+            best = score
+            best_yaw = yaw
+    return (DROPPED if best_yaw < 0 else np.int64(math.floor(best * SCORE_UNIT))), best_yaw
+
+
 @kernel
 def vote_masks(S, cells, first, last, boxes, weights, start, masks, pairs, cost, min_votes, scores, best_yaw):  # type: ignore[no-untyped-def]
     """Score the candidates ``first`` to ``last`` of ``cells``: see :func:`score_by_votes`."""
     for i in range(first, last):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        best = -np.inf
-        for yaw in range(pairs.shape[0]):
-            votes = 0
-            score = 0.0
-            for m in range(yaw * masks, (yaw + 1) * masks):
-                total = np.int64(0)
-                for b in range(start[m], start[m + 1]):
-                    total += weights[b] * sum_about(S, x, y, z, boxes[b])
-                if total > 0:
-                    votes += 1
-                    score += 1.0
-                elif total < 0:
-                    score -= 1.0
-            unlike = 0.0
-            for p in range(pairs.shape[1]):
-                one = sum_about(S, x, y, z, pairs[yaw, p, 0])
-                other = sum_about(S, x, y, z, pairs[yaw, p, 1])
-                if one + other > 0:
-                    unlike += abs(one - other) / (one + other)
-            if pairs.shape[1] > 0:
-                score -= cost * (unlike / pairs.shape[1])
-            if votes >= min_votes and score > best:
-                best = score
-                best_yaw[i] = yaw
-        scores[i] = DROPPED if best == -np.inf else np.int64(np.floor(best * SCORE_UNIT))
+        scores[i], yaw = votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes)
+        if yaw >= 0:
+            best_yaw[i] = yaw
 
 
 def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, I32]:
@@ -96,32 +106,32 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
 
 
 @bare_kernel
-def _rank(sums, count):  # type: ignore[no-untyped-def]
+def rank(sums, count):  # type: ignore[no-untyped-def]
     """Bring the three smallest of ``count`` rows to the first rows and the three largest to the last, lane by lane."""
     for i in range(min(3, count - 1)):
         for j in range(i + 1, count):
-            _order(sums, LANES * i, LANES * j)
+            order(sums, LANES * i, LANES * j)
     for i in range(count - 1, max(3, count - 3) - 1, -1):
         for j in range(3, i):
-            _order(sums, LANES * j, LANES * i)
+            order(sums, LANES * j, LANES * i)
 
 
 @rule
-def _order(sums, one, other):  # type: ignore[no-untyped-def]
+def order(sums, one, other):  # type: ignore[no-untyped-def]
     a, b = load(sums, one), load(sums, other)
     store(sums, one, smaller(a, b))
     store(sums, other, larger(a, b))
 
 
 @bare_kernel
-def _statistics(sums, count, ranked, features, first):  # type: ignore[no-untyped-def]
+def statistics_of(sums, count, ranked, features, first):  # type: ignore[no-untyped-def]
     """Write the statistics of ``count`` rows of ``sums`` to the rows of ``features`` from ``first`` on."""
     total = load(sums, 0)
     for i in range(1, count):
         total = add(total, load(sums, LANES * i))
     store(features, first + 4 * LANES, total)
     if ranked:
-        _rank(sums, count)
+        rank(sums, count)
         store(features, first, load(sums, 0))
         store(features, first + LANES, load(sums, 2 * LANES))
         store(features, first + 2 * LANES, load(sums, LANES * (count - 3)))
@@ -201,7 +211,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
                             sums[LANES * k + lane] = seen[alive[begin + lane], seen_start[g] + k, channel - 1]
                 else:
                     _look_up(flat, at, width, corners, group_start[g], count, sums)
-                _statistics(sums, count, ranked, features, FEATURES_PER_GROUP * LANES * g)
+                statistics_of(sums, count, ranked, features, FEATURES_PER_GROUP * LANES * g)
             _add_trees(
                 stage_trees[s], stage_trees[s + 1], leaf_start, leaves, node_start, nodes, cuts, features, values, total
             )  # fmt: skip

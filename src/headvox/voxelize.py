@@ -125,7 +125,20 @@ def new_box() -> npt.NDArray[np.int64]:
 
 
 @rule
-def _inside(x, y, z, limits):  # type: ignore[no-untyped-def]
+def moved(T, axis, x, y, z):  # type: ignore[no-untyped-def]
+    """Return where ``T`` (4, 4) takes places, along an axis."""
+    turned = add(mul(fill(T[axis, 0]), x), mul(fill(T[axis, 1]), y))
+    return add(fill(T[axis, 3]), add(turned, mul(fill(T[axis, 2]), z)))
+
+
+@rule
+def along_ray(t, far, column, row):  # type: ignore[no-untyped-def]
+    """Return where pixels with these depths are, along an axis: see :class:`Rays`."""
+    return add(fill(t), mul(far, add(column, fill(row))))
+
+
+@rule
+def inside(x, y, z, limits):  # type: ignore[no-untyped-def]
     """Return a bit for each place, in parts from the origin: whether it is within the region, and not NaN."""
     dx, dy, dz = sub(x, fill(limits[0])), sub(y, fill(limits[1])), sub(z, fill(limits[2]))
     distance = add(add(mul(dx, dx), mul(dy, dy)), mul(dz, dz))
@@ -133,7 +146,7 @@ def _inside(x, y, z, limits):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _code(x, y, z, ny, nz, shift):  # type: ignore[no-untyped-def]
+def code_of(x, y, z, ny, nz, shift):  # type: ignore[no-untyped-def]
     """Return cell * 8 + part of places inside, given in whole parts."""
     cell = add(times(add(times(shift_right(x, shift), ny), shift_right(y, shift)), nz), shift_right(z, shift))
     one = fill(shift)
@@ -150,18 +163,18 @@ def _mark(x, y, z, known, left, codes, at, limits, shape, shift, counting, extre
     part, and a part has to be entered but once. ``codes`` is overwritten. Return the codes; ``extremes`` widened by
     the cells: the lowest and the highest in x, y and z, a vector each; and the new count.
     """
-    inside = known & _inside(x, y, z, limits)
+    within = known & inside(x, y, z, limits)
     mine = fill(NOWHERE)
-    if inside:
+    if within:
         x, y, z = to_int(x), to_int(y), to_int(z)
-        mine = where(inside, _code(x, y, z, shape[1], shape[2], shift), mine)
+        mine = where(within, code_of(x, y, z, shape[1], shape[2], shift), mine)
         if not counting:
             above = equal(mine, load(codes, at)) | equal(mine, load(codes, at + 1))
-            inside &= ~(above | equal(mine, shifted(left, mine)))
+            within &= ~(above | equal(mine, shifted(left, mine)))
         extremes = _widened(
-            extremes, inside, shift_right(x, shift), shift_right(y, shift), shift_right(z, shift)
+            extremes, within, shift_right(x, shift), shift_right(y, shift), shift_right(z, shift)
         )
-        count = compress(new, count, inside, mine)
+        count = compress(new, count, within, mine)
     store(codes, at, mine)
     return mine, extremes, count
 
@@ -219,15 +232,7 @@ def mark_points(points, T, limits, shape, shift, counting, codes, new, few, box,
             for k in range(xyz.shape[0] - at):
                 few[k] = xyz[at + k]
             px, py, pz = load_triples(few, 0)
-        x = add(
-            fill(T[0, 3]), add(add(mul(fill(T[0, 0]), px), mul(fill(T[0, 1]), py)), mul(fill(T[0, 2]), pz))
-        )
-        y = add(
-            fill(T[1, 3]), add(add(mul(fill(T[1, 0]), px), mul(fill(T[1, 1]), py)), mul(fill(T[1, 2]), pz))
-        )
-        z = add(
-            fill(T[2, 3]), add(add(mul(fill(T[2, 0]), px), mul(fill(T[2, 1]), py)), mul(fill(T[2, 2]), pz))
-        )
+        x, y, z = moved(T, 0, px, py, pz), moved(T, 1, px, py, pz), moved(T, 2, px, py, pz)
         left, extremes, count = _mark(
             x, y, z, ALL, left, codes, 0, limits, shape, m, counting, extremes, new, count
         )
@@ -260,9 +265,9 @@ def mark_depth(  # type: ignore[no-untyped-def]
                     few[k] = flat[v * width + u + k]
                 raw = load(few, 0)
             far = to_float(raw)
-            x = add(fill(t[0]), mul(far, add(load(column[0], u), fill(row[0, v]))))
-            y = add(fill(t[1]), mul(far, add(load(column[1], u), fill(row[1, v]))))
-            z = add(fill(t[2]), mul(far, add(load(column[2], u), fill(row[2, v]))))
+            x = along_ray(t[0], far, load(column[0], u), row[0, v])
+            y = along_ray(t[1], far, load(column[1], u), row[1, v])
+            z = along_ray(t[2], far, load(column[2], u), row[2, v])
             known = ~equal(raw, sub(raw, raw))
             left, extremes, count = _mark(
                 x, y, z, known, left, codes, u, limits, shape, m, counting, extremes, new, count

@@ -1,0 +1,5 @@
+"""The search on an NVIDIA GPU: the same grid, sums, candidates, scores and peaks as on the CPU, bit for bit.
+
+One module a stage, as on the CPU, and the same scalar rules: :mod:`headvox.cuda.lanes` compiles the Python functions
+of the CPU's rules for the device. Nothing here is imported unless a detector is told to use it.
+"""

@@ -1,0 +1,166 @@
+"""How a loop is compiled for the device, and what a rule of the CPU means there: a lane is a thread.
+
+The CPU's rules are written in operations on lanes (:mod:`headvox.simd`). On the device each of these is an operation
+on one number, so that the same source says what is computed, here and there. Numba's simulator runs plain Python
+functions, one thread after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any
+
+import numba
+import numpy as np
+from numba import cuda
+
+from headvox.integral import box_sum
+from headvox.vote import sum_about
+
+SIMULATED = bool(numba.config.ENABLE_CUDASIM)
+
+Loop = Callable[..., Any]
+
+
+def kernel(function: Loop) -> Any:
+    """Compile ``function`` as a kernel; it is started as ``function[blocks, threads, stream](...)``."""
+    return cuda.jit(function)
+
+
+def device(function: Loop) -> Loop:
+    """Compile ``function`` to be called by kernels."""
+    compiled: Loop = function if SIMULATED else cuda.jit(device=True)(function)
+    return compiled
+
+
+def on_device(rule: Loop, **names: object) -> Loop:
+    """Return a rule of the CPU for the device, with ``names`` in place of what it calls so."""
+    source = rule.py_func  # type: ignore[attr-defined]
+    scope = {**source.__globals__, **names}
+    return device(FunctionType(source.__code__, scope, source.__name__, source.__defaults__))
+
+
+@device
+def fill(value):  # type: ignore[no-untyped-def]
+    """Return ``value``."""
+    return value
+
+
+@device
+def load(flat, at):  # type: ignore[no-untyped-def]
+    """Return the item of ``flat`` at ``at``."""
+    return flat[at]
+
+
+@device
+def store(flat, at, value):  # type: ignore[no-untyped-def]
+    """Set the item of ``flat`` at ``at``."""
+    flat[at] = value
+
+
+@device
+def add(a, b):  # type: ignore[no-untyped-def]
+    """Return a + b."""
+    return a + b
+
+
+@device
+def sub(a, b):  # type: ignore[no-untyped-def]
+    """Return a - b."""
+    return a - b
+
+
+@device
+def times(a, factor):  # type: ignore[no-untyped-def]
+    """Return a * factor, of whole numbers."""
+    return a * factor
+
+
+@device
+def bit_and(a, b):  # type: ignore[no-untyped-def]
+    """Return a & b."""
+    return a & b
+
+
+@device
+def shift_right(a, count):  # type: ignore[no-untyped-def]
+    """Return a >> count."""
+    return a >> count
+
+
+@device
+def below(a, b):  # type: ignore[no-untyped-def]
+    """Return 1 if a < b, else 0."""
+    return 1 if a < b else 0
+
+
+@device
+def less(a, b):  # type: ignore[no-untyped-def]
+    """Return 1 if a < b, else 0."""
+    return 1 if a < b else 0
+
+
+@device
+def within(a, low, high):  # type: ignore[no-untyped-def]
+    """Return 1 if low <= a <= high, else 0."""
+    return 1 if np.int64(low) <= a <= np.int64(high) else 0
+
+
+@device
+def smaller(a, b):  # type: ignore[no-untyped-def]
+    """Return the smaller of two."""
+    return min(a, b)
+
+
+@device
+def larger(a, b):  # type: ignore[no-untyped-def]
+    """Return the larger of two."""
+    return max(a, b)
+
+
+if SIMULATED:
+
+    def mul(a, b):  # type: ignore[no-untyped-def]
+        """Return a * b."""
+        return a * b
+
+    product_32 = product_64 = mul
+else:
+    from numba.cuda import libdevice
+
+    # A product that is rounded, whatever it is added to: the compiler may not contract it to a fused operation.
+    @device
+    def product_32(a, b):  # type: ignore[no-untyped-def]
+        """Return a * b of two float32, rounded."""
+        return libdevice.fmul_rn(a, b)
+
+    @device
+    def product_64(a, b):  # type: ignore[no-untyped-def]
+        """Return a * b of two float64, rounded."""
+        return libdevice.dmul_rn(a, b)
+
+    mul = product_32
+
+
+LANE_WISE = {
+    "LANES": 1,
+    "fill": fill,
+    "load": load,
+    "store": store,
+    "add": add,
+    "sub": sub,
+    "mul": mul,
+    "times": times,
+    "bit_and": bit_and,
+    "shift_right": shift_right,
+    "below": below,
+    "less": less,
+    "within": within,
+    "smaller": smaller,
+    "larger": larger,
+}
+"""Names of :mod:`headvox.simd`, and what they are on the device."""
+
+sum_about_voxel = on_device(sum_about, box_sum=on_device(box_sum))
+"""The sum over a box about a voxel, cut off at the edges of the integral volume: it needs no margins."""

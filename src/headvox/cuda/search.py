@@ -1,0 +1,295 @@
+"""The search of a batch of frames on the device: one upload, the stages one after the other, one download.
+
+Nothing is allocated per frame. All launches and copies are on one stream, and everything about a frame that a kernel
+needs is in the row that is uploaded: see :mod:`headvox.cuda.readings`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import cuda
+
+from headvox.cuda import compact, gate, integral, judge, suppress, vote, voxelize
+from headvox.cuda.lanes import SIMULATED
+from headvox.cuda.readings import Asked, pack, words_of
+from headvox.data import DepthImage
+from headvox.gate import gate_tables
+from headvox.masks import CompiledCascade, CompiledStages
+from headvox.suppress import PEAK_REACH
+from headvox.visibility import cells_of
+from headvox.vote import seen_boxes
+from headvox.voxelize import Lattice, Rays
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+
+# The simulator runs every thread in turn: a few of each kind are enough to show what goes wrong between them.
+THREADS = 2 if SIMULATED else 128
+ONE_BLOCK_THREADS = 3 if SIMULATED else compact.THREADS
+MOST_BLOCKS = 2 if SIMULATED else 4096
+STAGE_BLOCKS = 2 if SIMULATED else 1024  # each has working memory of its own
+SHARES = 7 if SIMULATED else 8192  # that bits are counted in
+FIRST_CANDIDATES = 64 if SIMULATED else 1 << 15
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What the search found in a frame: all integer, and the same as the CPU's.
+
+    ``cells`` (N, 3) of the lattice, ``scores`` (N,) in steps and ``yaws`` (N,) are of the peaks that were judged, in
+    the order of the volume. ``patches`` (P, side, side, side) are the cells of the grid about those that score enough,
+    and ``patch_of`` (N,) tells which is whose, or -1.
+    """
+
+    occupied: bool
+    candidates: int
+    cells: I32
+    scores: I64
+    yaws: I32
+    patches: npt.NDArray[Any]
+    patch_of: I64
+
+
+class Search:
+    """Kernels and buffers for up to ``frames`` frames at once, of lattices of one shape, by one cascade.
+
+    ``around`` (M, 3) are the voxels about a peak that compete for it, ``most_peaks`` how many peaks a frame may have,
+    and ``patch_reach`` how far about a peak the grid is wanted.
+    """
+
+    def __init__(
+        self, cascade: CompiledCascade, shape: tuple[int, int, int], frames: int, around: I32, most_peaks: int,
+        patch_reach: int,
+    ) -> None:  # fmt: skip
+        nx, ny, nz = self.shape = shape
+        self.cascade, self.frames, self.most_peaks, self.reach = cascade, frames, most_peaks, patch_reach
+        self.counting = cascade.source.counting
+        self.stream = cuda.stream()
+        self._cell_type = np.dtype(np.uint32 if self.counting else np.uint8)
+        self._upload(1)
+        cells = math.prod(shape)
+        self.cells = self._empty(cells if self.counting else -(-cells // 4), np.uint32)
+        self.S = cuda.device_array((frames, nx + 1, ny + 1, nz + 1), np.uint32)
+        self.places = (nx + 2) * (ny + 2) * (nz + 2)
+        self.passed = self._empty(-(-self.places // 32), np.uint32)
+        self.shares = self._empty(SHARES, np.int32)
+        self.counts = self._empty(suppress.KEPT + 1, np.int32)
+        self._make_room(FIRST_CANDIDATES)
+        self._tables(around)
+        each = judge.REPORT_HEADER + judge.ROW * most_peaks
+        side = 2 * patch_reach + 1
+        patch_bytes = most_peaks * side**3 * self._cell_type.itemsize
+        self.report = self._empty(8 * each + -(-patch_bytes // 8) * 8, np.uint8)
+        self.host_report = cuda.pinned_array(self.report.shape, np.uint8)
+        self._first_patch = 8 * each // self._cell_type.itemsize
+
+    def _empty(self, count: int, dtype: npt.DTypeLike) -> Any:
+        return cuda.device_array((self.frames, count), dtype)
+
+    def _upload(self, words: int) -> None:
+        """Have room for rows of so many words."""
+        words = -(-words // 4) * 4
+        self.host_rows = cuda.pinned_array((self.frames, words), np.int32)
+        self.host_rows[:] = 0
+        self.whole = cuda.device_array((self.frames, words), np.int32)
+        self.real, self.half = self.whole.view(np.float32), self.whole.view(np.uint16)
+        self.quads = self.real.reshape(self.frames, words // 4, 4)
+
+    def _make_room(self, candidates: int) -> None:
+        self.candidates = self._empty(candidates, np.int32)
+        self.scores, self.yaws = self._empty(candidates, np.int64), self._empty(candidates, np.int32)
+        self.yaws.copy_to_device(np.zeros((self.frames, candidates), np.int32))
+        self.marked = self._empty(-(-candidates // 32), np.uint32)
+        self.maxima, self.ranks = self._empty(candidates, np.int32), self._empty(candidates, np.int32)
+
+    def _tables(self, around: I32) -> None:
+        """Send the cascade to the device, and make room for what it says of the peaks."""
+        cascade, most = self.cascade, self.most_peaks
+        _, ny, nz = self.shape
+        self.column, self.layer = nz + 2, (ny + 2) * (nz + 2)
+        steps = around @ np.array([self.layer, self.column, 1])
+        self.stay = cuda.to_device(np.zeros(1, np.int32))
+        self.steps = cuda.to_device(steps.astype(np.int32))
+        weights, spans, rank, limits = gate_tables(cascade.gate, np.dtype(np.uint32))
+        self.gate = [cuda.to_device(np.ascontiguousarray(a)) for a in (cascade.gate.boxes, weights, spans, rank, limits)]
+        self.votes = _to_device(vote.votes_table(cascade.votes)) if cascade.votes else None
+        self.search = _to_device(vote.stages_table(cascade.stages)) if cascade.stages else None
+        self.judge = _to_device(vote.stages_table(cascade.judge)) if cascade.judge else None
+        sizes = vote.Sizes.of(cascade.stages, cascade.judge)
+        self.sums = cuda.device_array((self.frames * STAGE_BLOCKS, sizes.boxes), np.int64)
+        self.features = cuda.device_array((self.frames * STAGE_BLOCKS, sizes.features), np.int64)
+        self.about_scores = self._empty(most * len(steps), np.int64)
+        self.peaks, self.peak_places = self._empty(most, np.int32), self._empty(most, np.int32)
+        self.peak_scores, self.best = self._empty(most, np.int64), self._empty(most, np.int32)
+        self.judged, self.judged_places = self._empty(most, np.int32), self._empty(most, np.int32)
+        self.judged_scores, self.kept = self._empty(most, np.int64), self._empty(most, np.int32)
+        self.unseen = cuda.to_device(np.zeros((self.frames, 1, 1, 2), np.int32))
+        boxes = seen_boxes(cascade.judge)[0] if cascade.judge else np.zeros((0, 6), np.int32)
+        offsets, start = cells_of(boxes)
+        self.sees = len(offsets) > 0
+        if self.sees:
+            self.offsets, self.start = cuda.to_device(offsets), cuda.to_device(start)
+            self.states = cuda.device_array((self.frames, most, len(offsets)), np.uint8)
+            self.seen = cuda.device_array((self.frames, most, len(boxes), 2), np.int32)
+
+    # ------------------------------------------------------------------------------------------------ the frames
+
+    def run(self, asked: Sequence[Asked], rays_of: Callable[[DepthImage, Lattice], Rays]) -> list[Found]:
+        """Return what is found in each of up to ``frames`` frames."""
+        words = max(words_of(one.frame) for one in asked)
+        if words > self.host_rows.shape[1]:
+            self._upload(words + words // 4)
+        for one, row in zip(asked, self.host_rows, strict=False):
+            pack(one, rays_of, row)
+        sensors = max(len(one.frame.clouds) + len(one.frame.depths) for one in asked)
+        while True:
+            self.whole.copy_to_device(self.host_rows, stream=self.stream)
+            self.launch(len(asked), sensors)
+            self.report.copy_to_host(self.host_report, stream=self.stream)
+            self.stream.synchronize()
+            found = [self._read(row) for row in self.host_report[: len(asked)]]
+            most = max(one.candidates for one in found)
+            if most <= self.candidates.shape[1]:
+                return found
+            self._make_room(2 * most)  # and again: some did not fit
+
+    def launch(self, frames: int, sensors: int) -> None:
+        """Start all stages for the first ``frames`` rows, which have been uploaded."""
+        self._voxelize(frames, sensors)
+        self._integrate(frames)
+        self._gate(frames)
+        self._vote(frames)
+        self._suppress(frames)
+        self._judge(frames)
+        self._report(frames)
+
+    def _on(self, items: int, frames: int, sensors: int = 1) -> tuple[Any, ...]:
+        """Return how to launch a kernel over so many items a frame."""
+        return (min(-(-items // THREADS), MOST_BLOCKS), frames, sensors), THREADS, self.stream
+
+    def _voxelize(self, frames: int, sensors: int) -> None:
+        shift = self.cascade.source.subdivision - 1
+        voxelize.clear[self._on(self.passed.shape[1], frames)](self.cells, self.passed, self.marked, self.counts)
+        items = self.whole.shape[1] // 2
+        voxelize.mark[self._on(items, frames, sensors)](
+            self.whole, self.real, self.quads, self.half, self.shape, shift, self.counting, self.cells
+        )
+
+    def _integrate(self, frames: int) -> None:
+        nx, ny, nz = (n + 1 for n in self.shape)
+        integral.sum_along_z[self._on(nx * ny, frames)](self.cells, self.counting, self.S)
+        integral.sum_along_y[self._on(nx * nz, frames)](self.S)
+        integral.sum_along_x[self._on(ny * nz, frames)](self.S)
+
+    def _gate(self, frames: int) -> None:
+        spacing = self.cascade.gate.spacing
+        gate.gate[self._on(math.prod(self.shape), frames)](self.S, self.whole, *self.gate, spacing, self.passed)
+        self._compact(self.passed, suppress.CANDIDATES, self.candidates, frames)
+
+    def _compact(self, bits: Any, which: int, listed: Any, frames: int) -> None:
+        compact.count_bits[self._on(SHARES, frames)](bits, self.shares)
+        compact.add_up[(1, frames), ONE_BLOCK_THREADS, self.stream](self.shares, self.counts, which)
+        compact.list_bits[self._on(SHARES, frames)](bits, self.shares, listed)
+
+    def _vote(self, frames: int) -> None:
+        votes, stages = self.cascade.votes, self.cascade.stages
+        if stages is not None:
+            self._score(
+                self.candidates, self.stay, suppress.CANDIDATES, self.search, stages.occupied_stages, self.unseen,
+                False, self.scores, frames,
+            )  # fmt: skip
+        elif votes is not None:
+            vote.vote_masks[self._on(self.candidates.shape[1], frames)](
+                self.S, self.candidates, self.counts, suppress.CANDIDATES, self.votes, votes.masks,
+                votes.asymmetry_cost, votes.min_votes, self.scores, self.yaws,
+            )  # fmt: skip
+
+    def _score(
+        self, places: Any, steps: Any, which: int, table: Any, to_stage: int, seen: Any, sees: bool, scores: Any,
+        frames: int,
+    ) -> None:  # fmt: skip
+        vote.vote_stages[(STAGE_BLOCKS, frames), THREADS, self.stream](
+            self.S, self.whole, places, steps, self.counts, which, table, seen, sees, to_stage, self.sums,
+            self.features, scores,
+        )  # fmt: skip
+
+    def _suppress(self, frames: int) -> None:
+        on = self._on(self.candidates.shape[1], frames)
+        reach = PEAK_REACH[self.cascade.gate.spacing]
+        suppress.mark_maxima[on](
+            self.candidates, self.counts, self.scores, reach, self.column, self.layer, self.marked
+        )
+        self._compact(self.marked, suppress.MAXIMA, self.maxima, frames)
+        suppress.rank_maxima[on](self.maxima, self.counts, self.scores, self.most_peaks, self.ranks)
+        suppress.list_peaks[on](
+            self.maxima, self.counts, self.ranks, self.candidates, self.scores, self.peaks, self.peak_places,
+            self.peak_scores,
+        )  # fmt: skip
+
+    def _judge(self, frames: int) -> None:
+        stages: CompiledStages | None = self.cascade.judge
+        scores, steps = self.peak_scores, self.stay
+        if stages is not None:
+            scores, steps = self.about_scores, self.steps
+            occupied = stages.occupied_stages
+            self._score(
+                self.peak_places, steps, suppress.PEAKS, self.judge, occupied, self.unseen, False, scores, frames
+            )
+        judge.keep_best[(1, frames), ONE_BLOCK_THREADS, self.stream](
+            self.counts, steps, scores, self.peaks, self.peak_places, self.best, self.judged, self.judged_places,
+            self.judged_scores,
+        )  # fmt: skip
+        if stages is None or not self.sees:
+            return
+        judge.look_about[self._on(self.most_peaks * len(self.offsets), frames)](
+            self.S, self.whole, self.quads, self.half, self.counts, self.judged_places, self.offsets, self.states
+        )
+        judge.count_states[self._on(self.most_peaks, frames)](
+            self.whole, self.counts, self.states, self.start, self.seen
+        )
+        self._score(
+            self.judged_places, self.stay, suppress.JUDGED, self.judge, len(stages.stage_keep), self.seen, True,
+            self.judged_scores, frames,
+        )  # fmt: skip
+
+    def _report(self, frames: int) -> None:
+        judge.report[(1, frames), 1, self.stream](
+            self.S, self.whole, self.counts, self.judged, self.judged_places, self.judged_scores, self.yaws, self.kept,
+            self.report.view(np.int64),
+        )  # fmt: skip
+        judge.copy_patches[self._on(self.most_peaks * THREADS, frames)](
+            self.S, self.counts, self.cells.view(self._cell_type), self.kept, self.reach,
+            self.report.view(self._cell_type), self._first_patch,
+        )  # fmt: skip
+
+    def _read(self, report: npt.NDArray[np.uint8]) -> Found:
+        """Return what a frame's report says, in memory of its own."""
+        head = 8 * (judge.REPORT_HEADER + judge.ROW * self.most_peaks)
+        numbers = report[:head].view(np.int64)
+        rows = numbers[judge.REPORT_HEADER :].reshape(-1, judge.ROW)[: numbers[judge.COUNT]]
+        place = rows[:, judge.PLACE]
+        cells = np.stack(
+            [place // self.layer, place % self.layer // self.column, place % self.column], axis=1
+        )
+        side = 2 * self.reach + 1
+        patch_of = rows[:, judge.PATCH].copy()
+        patches = report[head:].view(self._cell_type)[: self.most_peaks * side**3].reshape(-1, side, side, side)
+        return Found(
+            bool(numbers[judge.TOTAL]),
+            int(numbers[judge.FOUND]),
+            (cells - 1).astype(np.int32),
+            rows[:, judge.SCORE].copy(),
+            rows[:, judge.YAW].astype(np.int32),
+            patches[: patch_of.max(initial=-1) + 1].copy(),
+            patch_of,
+        )
+
+
+def _to_device(tables: tuple[npt.NDArray[Any], ...]) -> tuple[Any, ...]:
+    return tuple(cuda.to_device(np.ascontiguousarray(table)) for table in tables)

@@ -21,6 +21,7 @@ else:
 
 
 REFINE = ("pose", "sphere", "none")
+BACKENDS = ("cpu", "cuda", "auto")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,9 @@ class DetectorConfig:
     """Where a tracker expects a head, it may score this much less than others."""
     threads: int = 1
     """Threads a frame is split over. The output does not depend on it."""
+    backend: str = "cpu"
+    """Where heads are searched for: "cpu", "cuda" (an NVIDIA GPU) or "auto" (the GPU if there is one). The output does
+    not depend on it."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -63,6 +67,7 @@ class DetectorConfig:
             low < high <= low + 20.0, "max_height_m", f"above min_height_m ({low:g}), by 20 m at most", high
         )
         _require(self.refine in REFINE, "refine", '"pose", "sphere" or "none"', self.refine)
+        _require(self.backend in BACKENDS, "backend", '"cpu", "cuda" or "auto"', self.backend)
         _require(1 <= self.threads <= 64, "threads", "1 to 64", self.threads)
         if self.voxel_m is not None:
             _require(0.005 <= self.voxel_m <= 0.2, "voxel_m", "0.005 to 0.2 m", self.voxel_m)
@@ -190,7 +195,7 @@ def _check_type(key: str, value: object) -> None:
             isinstance(value, (list, tuple)) and len(value) == 3 and all(_is_number(v, 1e8) for v in value)
         )
         _require(good, key, "three numbers, 1e8 m at most", value)
-    elif key in ("cascade", "refine"):
+    elif key in ("cascade", "refine", "backend"):
         _require(isinstance(value, str), key, "text", value)
     elif key == "threads":
         _require(isinstance(value, Integral) and _is_number(value, 1e9), key, "a whole number", value)

@@ -163,6 +163,9 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         help="how much less a head may score where a tracker expects it",
     )
     group.add_argument(
+        "--backend", choices=("cpu", "cuda", "auto"), help="where heads are searched for: see docs/cuda.md"
+    )
+    group.add_argument(
         "--threads", type=whole_number, metavar="N", help="threads for a frame; the heads are the same"
     )
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -14,6 +15,8 @@ import numpy.typing as npt
 
 from headvox.align import Scratch
 from headvox.config import DetectorConfig
+from headvox.cuda.device import BATCH, Device, DeviceLost, use_device
+from headvox.cuda.readings import Asked, Found
 from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
@@ -23,7 +26,7 @@ from headvox.integral import box_reach, integrate, set_corners, shape_with_margi
 from headvox.kernels import Threads, read_only
 from headvox.masks import SCORE_UNIT, CompiledStages, compile_cascade, load_cascade
 from headvox.pose import fit_poses
-from headvox.refine import HAIR_M, MOST_PARTS, fit_spheres
+from headvox.refine import HAIR_M, MOST_PARTS, cells_about, fit_spheres
 from headvox.simd import LANES
 from headvox.suppress import PEAK_REACH, local_maxima, suppress_overlaps
 from headvox.visibility import camera_table, cells_of, count_states, look_about
@@ -43,6 +46,8 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
+DEVICE_STAGES = ("search", "refine")
+"""On a GPU, all before the refinement is one stage, and includes the copies there and back."""
 SAME_HEAD_M = 0.18
 MOST_PEAKS = 256
 NEIGHBOURS = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
@@ -57,7 +62,8 @@ class Detector:
     """Finds heads in point clouds and depth images.
 
     A detector keeps its working memory between frames, so it is not for two threads at once: give each its own.
-    ``stage_ms`` holds what each stage of the last frame took.
+    ``stage_ms`` holds what each stage of the last frame took. ``backend`` goes before that of ``config``; ``note`` is
+    told what a user should know, by default as a Python warning.
 
     >>> import numpy as np
     >>> detector = Detector()
@@ -65,10 +71,22 @@ class Detector:
     0
     """
 
-    def __init__(self, config: DetectorConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: DetectorConfig | None = None,
+        *,
+        backend: str | None = None,
+        note: Callable[[str], None] | None = None,
+    ) -> None:
         self.config = config or DetectorConfig()
+        if backend is not None:
+            self.config = replace(self.config, backend=backend)
+        self._note = note or _warn
         self.cascade = compile_cascade(load_cascade(self.config.cascade), self.config.voxel_m)
-        self.stage_ms = dict.fromkeys(STAGES, 0.0)
+        self.on_device = self.config.backend != "cpu" and use_device(self.config.backend)
+        """Whether frames are searched on a GPU; it ends when the GPU fails."""
+        self._device: Device | None = None
+        self.stage_ms = dict.fromkeys(DEVICE_STAGES if self.on_device else STAGES, 0.0)
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
         self._threads = Threads(self.config.threads)
@@ -104,6 +122,8 @@ class Detector:
         Within the reach of where a head is ``expected``, one that scores a little too low (``score_slack``) is kept
         too, and marked as not sure.
         """
+        if self.on_device:
+            return self._detect_on_device([frame], [expected])[0]
         _check_frame(frame)
         clock = _Clock(self.stage_ms)
         memory = self._memory_for(frame)
@@ -125,9 +145,79 @@ class Detector:
         clock.done("refine")
         return heads
 
+    def detect_batch(self, frames: Sequence[Frame]) -> list[Heads]:
+        """Return the heads in each of ``frames``, as :meth:`detect_frame` does; on a GPU, several go at once.
+
+        Raises:
+            HeadvoxError: as :meth:`detect_frame`; of several, the first.
+        """
+        if not self.on_device:
+            return [self.detect_frame(frame) for frame in frames]
+        parts = [frames[first : first + BATCH] for first in range(0, len(frames), BATCH)]
+        return [heads for part in parts for heads in self._detect_on_device(part, [None] * len(part))]
+
     def close(self) -> None:
         """End the detector's threads."""
         self._threads.close()
+
+    # --------------------------------------------------------------------------------------------------- on a GPU
+
+    def _detect_on_device(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
+        """Return the heads in up to :data:`BATCH` frames; where the GPU fails, by the CPU, and from then on."""
+        for frame in frames:
+            _check_frame(frame)
+        clock = _Clock(self.stage_ms)
+        asked = [self._asked(frame, one) for frame, one in zip(frames, expected, strict=True)]
+        try:
+            found = self._device_for(asked[0].lattice).search(asked, self._rays_of)
+        except DeviceLost as error:
+            self._note(
+                f"the GPU failed ({error}): this frame is done again, and all further ones, on the CPU"
+            )
+            self.on_device, self._device = False, None
+            self.stage_ms = dict.fromkeys(STAGES, 0.0)
+            return [self.detect_frame(frame, one) for frame, one in zip(frames, expected, strict=True)]
+        clock.done("search")
+        heads = [self._refine_found(*each) for each in zip(asked, found, expected, strict=True)]
+        clock.done("refine")
+        return heads
+
+    def _asked(self, frame: Frame, expected: Expected | None) -> Asked:
+        """Return what the device is to do with ``frame``."""
+        lattice = self._memory_for(frame).lattice
+        kept = self._threshold(frame) - (self._slack() if expected is not None and len(expected) else 0)
+        return Asked(frame, lattice, self._sees(frame), kept)
+
+    def _device_for(self, lattice: Lattice) -> Device:
+        if (
+            self._device is None
+            or self._device.shape != lattice.shape
+            or self._device.cascade is not self.cascade
+        ):
+            around = AROUND[self.cascade.gate.spacing]
+            self._device = Device(
+                self.cascade, lattice.shape, around, MOST_PEAKS, cells_about(lattice.voxel_m)
+            )
+        return self._device
+
+    def _refine_found(self, asked: Asked, found: Found, expected: Expected | None) -> Heads:
+        """Return the heads of a frame that the device searched: from here on it is as on the CPU."""
+        memory = self._memory_for(asked.frame)
+        memory.clear()
+        memory.dirty = (0, 0)
+        self.candidates = found.candidates
+        if not found.occupied:
+            raise _nothing_in_range(asked.frame, asked.lattice.region)
+        memory.first = np.zeros(3, np.int64)
+        memory.enter_patches(found)
+        memory.make_room(len(found.cells))
+        memory.yaws[: len(found.cells)] = found.yaws
+        threshold = self._threshold(asked.frame)
+        kept = self._kept(found.cells, found.scores, threshold, memory, expected)
+        peaks = np.flatnonzero(kept)
+        return self._refine(
+            asked.frame, found.cells[kept], found.scores[kept], peaks, threshold, memory, expected
+        )
 
     # -------------------------------------------------------------------------------------------------- the stages
 
@@ -266,21 +356,40 @@ class Detector:
         Returned are their cells, their scores, which of the peaks they were, and the threshold, in steps of the score.
         """
         cells, scores, judge = survivors[peaks], scores[peaks], memory.judge
-        sees = memory.sees and len(frame.depths) > 0 and not frame.clouds
         if judge is not None and len(cells):
             cells, scores, found = self._best_about(S, cells, judge, memory)
             peaks = peaks[found]
-            if sees and len(cells):
+            if self._sees(frame) and len(cells):
                 scores = self._look_about(frame, S, cells, judge, memory)
+        threshold = self._threshold(frame)
+        kept = self._kept(cells, scores, threshold, memory, expected)
+        return cells[kept], scores[kept], peaks[kept], threshold
+
+    def _sees(self, frame: Frame) -> bool:
+        """Whether the judge can ask the cameras what they saw: not with clouds, of which nobody knows what is free."""
+        return self.cascade.source.sees and len(frame.depths) > 0 and not frame.clouds
+
+    def _threshold(self, frame: Frame) -> int:
+        """Return the least score of a head, in steps."""
         cascade, least = self.cascade.source, self.config.min_score
         if least is None:
-            least = cascade.min_score if sees or not memory.sees else cascade.min_score_occupied
-        threshold = math.ceil(least * SCORE_UNIT)
-        kept = scores >= threshold
+            blind = cascade.sees and not self._sees(frame)
+            least = cascade.min_score_occupied if blind else cascade.min_score
+        return math.ceil(least * SCORE_UNIT)
+
+    def _slack(self) -> int:
+        """Return how much less a head may score where one is expected, in steps."""
+        return math.floor(self.config.score_slack * SCORE_UNIT)
+
+    def _kept(
+        self, cells: I32, scores: I64, threshold: int, memory: _Memory, expected: Expected | None
+    ) -> npt.NDArray[np.bool_]:
+        """Return which of the peaks reach the threshold, or nearly so where a head is expected."""
+        kept: npt.NDArray[np.bool_] = scores >= threshold
         if expected is not None and len(expected):
-            weaker = scores >= threshold - math.floor(self.config.score_slack * SCORE_UNIT)
+            weaker = scores >= threshold - self._slack()
             kept |= weaker & self._is_expected(cells, expected, memory)
-        return cells[kept], scores[kept], peaks[kept], threshold
+        return kept
 
     def _best_about(
         self, S: npt.NDArray[Any], cells: I32, judge: _Stages, memory: _Memory
@@ -454,7 +563,6 @@ class _Memory:
         self.survivors = np.empty((4096, 3), np.int32)
         self.points = np.empty((MOST_PARTS, 3))
         self.unseen = np.zeros((1, 1, 2), np.int32)
-        self.sees = cascade.source.sees
         self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
         self.judge = _Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
         self.scratch = [Scratch.new() for _ in range(threads if detector.config.refine == "pose" else 0)]
@@ -469,6 +577,22 @@ class _Memory:
         else:
             self.cells[0][self.dirty[0] : self.dirty[1]] = 0
         self.dirty = None
+
+    def enter_patches(self, found: Found) -> None:
+        """Enter the cells about the peaks that the device found into the grid, for the fit of spheres."""
+        cells, reach = self.cells[0], found.patches.shape[1] // 2
+        has_patch = found.patch_of >= 0
+        patches = found.patches[found.patch_of[has_patch]]
+        for centre, patch in zip(found.cells[has_patch].tolist(), patches, strict=True):
+            low = [max(c - reach, 0) for c in centre]
+            high = [min(c + reach + 1, n) for c, n in zip(centre, cells.shape, strict=True)]
+            inside = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+            from_patch = tuple(
+                slice(a - c + reach, b - c + reach) for a, b, c in zip(low, high, centre, strict=True)
+            )
+            cells[inside] = patch[from_patch]
+            first, after = self.dirty if self.dirty and self.dirty != (0, 0) else (low[0], high[0])
+            self.dirty = (min(first, low[0]), max(after, high[0]))
 
     def candidates_about(self, occupied: I64) -> I64:
         """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""
@@ -513,6 +637,10 @@ class _Stages:
         return cls(
             compiled, stages.tables, memory, np.empty((len(compiled.boxes), 8), np.uint64), *cells_of(boxes)
         )
+
+
+def _warn(text: str) -> None:
+    warnings.warn(f"headvox: {text}", RuntimeWarning, stacklevel=4)
 
 
 class _Clock:

@@ -7,6 +7,8 @@ the surface that a sensor sees, so the centre of the skull lies ``HAIR_M`` below
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from headvox.kernels import kernel, rule
@@ -20,6 +22,11 @@ SURFACE_SIGMA_M = 0.012
 STEPS = 10
 HAIR_M = 0.0135  # the median over 710 simulated heads, with one camera (553) and with several alike
 MOST_PARTS = 8192
+
+
+def cells_about(voxel_m: float) -> int:
+    """Return how many cells about a voxel, to each side, :func:`fit_spheres` looks at."""
+    return math.ceil(REACH_M / voxel_m)
 
 
 @rule

@@ -79,7 +79,9 @@ def opened(args: argparse.Namespace, track: bool = True) -> Iterator[Session]:
             live.note(f"no SOURCE given: running the sample that ships with headvox, {path}")
         for note in notes:
             live.note(f"headvox: {note}")
-        detector = stack.enter_context(closing(Detector(config)))
+        detector = stack.enter_context(
+            closing(Detector(config, note=lambda text: live.note(f"headvox: {text}")))
+        )
         tracker = Tracker(tracker_config) if track else None
         inputs = (path, args.config, config.cascade)
         yield Session(source, detector, tracker, live, inputs, config, args.strict, args.limit)

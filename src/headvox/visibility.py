@@ -49,8 +49,8 @@ def pixel_of(camera, x, y, z):  # type: ignore[no-untyped-def]
     if not far > np.float32(NEAREST_M):
         return -1, -1, far
     half = np.float32(0.5)
-    column = int(math.floor(project(camera, 0, x, y, z) / far + half))
-    row = int(math.floor(project(camera, 1, x, y, z) / far + half))
+    column = np.int64(math.floor(project(camera, 0, x, y, z) / far + half))
+    row = np.int64(math.floor(project(camera, 1, x, y, z) / far + half))
     return column, row, far
 
 

@@ -118,6 +118,7 @@ def rank(sums, count):  # type: ignore[no-untyped-def]
 
 @rule
 def order(sums, one, other):  # type: ignore[no-untyped-def]
+    """Exchange two rows where the first is larger, lane by lane."""
     a, b = load(sums, one), load(sums, other)
     store(sums, one, smaller(a, b))
     store(sums, other, larger(a, b))

@@ -54,7 +54,10 @@ def keep_best(counts, steps, about_scores, peaks, peak_places, best, judged, jud
         return
     kept = 0
     for i in range(count):
-        place, score = peak_places[frame, i] + steps[best[frame, i]], about_scores[frame, i * each + best[frame, i]]
+        place, score = (
+            peak_places[frame, i] + steps[best[frame, i]],
+            about_scores[frame, i * each + best[frame, i]],
+        )
         new = score > DROPPED
         for j in range(kept):
             new = new and judged_places[frame, j] != place
@@ -80,7 +83,11 @@ def look_about(S, whole, quads, half, counts, judged_places, offsets, states):  
         for sensor in range(whole[frame, SENSORS]):
             at = HEADER + sensor * SENSOR
             if whole[frame, at + KIND] == DEPTH and state != EMPTY:
-                data, width, height = whole[frame, at + DATA], whole[frame, at + WIDTH], whole[frame, at + HEIGHT]
+                data, width, height = (
+                    whole[frame, at + DATA],
+                    whole[frame, at + WIDTH],
+                    whole[frame, at + HEIGHT],
+                )
                 camera = quads[frame, (at + TABLE) // 4 : (at + TABLE) // 4 + 4]
                 column, row, far = _pixel_of(
                     camera,

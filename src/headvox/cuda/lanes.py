@@ -11,14 +11,14 @@ from collections.abc import Callable
 from types import FunctionType
 from typing import Any
 
-import numba
 import numpy as np
 from numba import cuda
+from numba.core import config
 
 from headvox.integral import box_sum
 from headvox.vote import sum_about
 
-SIMULATED = bool(numba.config.ENABLE_CUDASIM)
+SIMULATED = bool(getattr(config, "ENABLE_CUDASIM", 0))
 
 Loop = Callable[..., Any]
 

@@ -1,6 +1,9 @@
-"""What is uploaded: everything that the sensors saw in a frame, and where they stand, in one row of a buffer.
+"""What goes to the device and comes back.
 
-A row is read as int32, float32 and uint16 at once, and 4x4 matrices begin at whole quads of words; offsets are numbers of items of the type that lies there.
+Uploaded is everything that the sensors saw in a frame, and where they stand, in one row of a buffer.
+
+A row is read as int32, float32 and uint16 at once; offsets are numbers of items of the type that lies there, and 4x4
+matrices begin at whole quads of words.
 
     header    how many sensors, whether the cameras are asked what they saw, the parity of cell 0, 0, 0, the threshold
               in two words, and the limits of the region
@@ -13,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +32,7 @@ SENSOR = 40
 NOTHING, CLOUD, DEPTH = 0, 1, 2
 
 I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +43,24 @@ class Asked:
     lattice: Lattice
     sees: bool
     threshold: int
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What the search found in a frame: all integer, and the same as the CPU's.
+
+    ``cells`` (N, 3) of the lattice, ``scores`` (N,) in steps and ``yaws`` (N,) are of the peaks that were judged, in
+    the order of the volume. ``patches`` (P, side, side, side) are the cells of the grid about those that score enough,
+    and ``patch_of`` (N,) tells which is whose, or -1.
+    """
+
+    occupied: bool
+    candidates: int
+    cells: I32
+    scores: I64
+    yaws: I32
+    patches: npt.NDArray[Any]
+    patch_of: I64
 
 
 def words_of(frame: Frame) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numba import cuda
 
 from headvox.cuda import compact, gate, integral, judge, suppress, vote, voxelize
 from headvox.cuda.lanes import SIMULATED
-from headvox.cuda.readings import Asked, pack, words_of
+from headvox.cuda.readings import Asked, Found, pack, words_of
 from headvox.data import DepthImage
 from headvox.gate import gate_tables
 from headvox.masks import CompiledCascade, CompiledStages
@@ -27,7 +26,6 @@ from headvox.vote import seen_boxes
 from headvox.voxelize import Lattice, Rays
 
 I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 
 # The simulator runs every thread in turn: a few of each kind are enough to show what goes wrong between them.
 THREADS = 2 if SIMULATED else 128
@@ -38,24 +36,6 @@ SHARES = 7 if SIMULATED else 8192  # that bits are counted in
 FIRST_CANDIDATES = 64 if SIMULATED else 1 << 15
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """What the search found in a frame: all integer, and the same as the CPU's.
-
-    ``cells`` (N, 3) of the lattice, ``scores`` (N,) in steps and ``yaws`` (N,) are of the peaks that were judged, in
-    the order of the volume. ``patches`` (P, side, side, side) are the cells of the grid about those that score enough,
-    and ``patch_of`` (N,) tells which is whose, or -1.
-    """
-
-    occupied: bool
-    candidates: int
-    cells: I32
-    scores: I64
-    yaws: I32
-    patches: npt.NDArray[Any]
-    patch_of: I64
-
-
 class Search:
     """Kernels and buffers for up to ``frames`` frames at once, of lattices of one shape, by one cascade.
 
@@ -64,8 +44,8 @@ class Search:
     """
 
     def __init__(
-        self, cascade: CompiledCascade, shape: tuple[int, int, int], frames: int, around: I32, most_peaks: int,
-        patch_reach: int,
+        self, cascade: CompiledCascade, shape: tuple[int, int, int], around: I32, most_peaks: int, patch_reach: int,
+        frames: int,
     ) -> None:  # fmt: skip
         nx, ny, nz = self.shape = shape
         self.cascade, self.frames, self.most_peaks, self.reach = cascade, frames, most_peaks, patch_reach
@@ -117,7 +97,7 @@ class Search:
         self.stay = cuda.to_device(np.zeros(1, np.int32))
         self.steps = cuda.to_device(steps.astype(np.int32))
         weights, spans, rank, limits = gate_tables(cascade.gate, np.dtype(np.uint32))
-        self.gate = [cuda.to_device(np.ascontiguousarray(a)) for a in (cascade.gate.boxes, weights, spans, rank, limits)]
+        self.gate = _to_device((cascade.gate.boxes, weights, spans, rank, limits))
         self.votes = _to_device(vote.votes_table(cascade.votes)) if cascade.votes else None
         self.search = _to_device(vote.stages_table(cascade.stages)) if cascade.stages else None
         self.judge = _to_device(vote.stages_table(cascade.judge)) if cascade.judge else None
@@ -175,7 +155,9 @@ class Search:
 
     def _voxelize(self, frames: int, sensors: int) -> None:
         shift = self.cascade.source.subdivision - 1
-        voxelize.clear[self._on(self.passed.shape[1], frames)](self.cells, self.passed, self.marked, self.counts)
+        voxelize.clear[self._on(self.passed.shape[1], frames)](
+            self.cells, self.passed, self.marked, self.counts
+        )
         items = self.whole.shape[1] // 2
         voxelize.mark[self._on(items, frames, sensors)](
             self.whole, self.real, self.quads, self.half, self.shape, shift, self.counting, self.cells
@@ -189,7 +171,9 @@ class Search:
 
     def _gate(self, frames: int) -> None:
         spacing = self.cascade.gate.spacing
-        gate.gate[self._on(math.prod(self.shape), frames)](self.S, self.whole, *self.gate, spacing, self.passed)
+        gate.gate[self._on(math.prod(self.shape), frames)](
+            self.S, self.whole, *self.gate, spacing, self.passed
+        )
         self._compact(self.passed, suppress.CANDIDATES, self.candidates, frames)
 
     def _compact(self, bits: Any, which: int, listed: Any, frames: int) -> None:
@@ -239,7 +223,15 @@ class Search:
             scores, steps = self.about_scores, self.steps
             occupied = stages.occupied_stages
             self._score(
-                self.peak_places, steps, suppress.PEAKS, self.judge, occupied, self.unseen, False, scores, frames
+                self.peak_places,
+                steps,
+                suppress.PEAKS,
+                self.judge,
+                occupied,
+                self.unseen,
+                False,
+                scores,
+                frames,
             )
         judge.keep_best[(1, frames), ONE_BLOCK_THREADS, self.stream](
             self.counts, steps, scores, self.peaks, self.peak_places, self.best, self.judged, self.judged_places,
@@ -248,7 +240,14 @@ class Search:
         if stages is None or not self.sees:
             return
         judge.look_about[self._on(self.most_peaks * len(self.offsets), frames)](
-            self.S, self.whole, self.quads, self.half, self.counts, self.judged_places, self.offsets, self.states
+            self.S,
+            self.whole,
+            self.quads,
+            self.half,
+            self.counts,
+            self.judged_places,
+            self.offsets,
+            self.states,
         )
         judge.count_states[self._on(self.most_peaks, frames)](
             self.whole, self.counts, self.states, self.start, self.seen
@@ -279,7 +278,9 @@ class Search:
         )
         side = 2 * self.reach + 1
         patch_of = rows[:, judge.PATCH].copy()
-        patches = report[head:].view(self._cell_type)[: self.most_peaks * side**3].reshape(-1, side, side, side)
+        patches = (
+            report[head:].view(self._cell_type)[: self.most_peaks * side**3].reshape(-1, side, side, side)
+        )
         return Found(
             bool(numbers[judge.TOTAL]),
             int(numbers[judge.FOUND]),

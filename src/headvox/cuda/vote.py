@@ -7,6 +7,7 @@ numbers, so that the order does not matter.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,9 @@ def vote_stages(S, whole, places, steps, counts, which, table, seen, sees, to_st
             for u in range(used_start[stage] + thread, used_start[stage + 1], threads):
                 g = used[u, 0]
                 first, after = group_start[g], group_start[g + 1]
-                _statistics_of(mine[first:after], after - first, used[u, 1], statistics, FEATURES_PER_GROUP * g)
+                _statistics_of(
+                    mine[first:after], after - first, used[u, 1], statistics, FEATURES_PER_GROUP * g
+                )
             cuda.syncthreads()
             part = np.int64(0)
             for tree in range(stage_trees[stage] + thread, stage_trees[stage + 1], threads):
@@ -124,12 +127,11 @@ def vote_stages(S, whole, places, steps, counts, which, table, seen, sees, to_st
 
 def stages_table(stages: CompiledStages) -> tuple[npt.NDArray[Any], ...]:
     """Return the arrays of ``stages`` that :func:`vote_stages` reads."""
-    group_start, group_channel, seen_start, used_start, used, *_ = StageTables.of(stages, np.dtype(np.uint32)).tables
+    group_start, group_channel, seen_start, used_start, used, *_ = StageTables.of(
+        stages, np.dtype(np.uint32)
+    ).tables
     group_of = np.repeat(np.arange(len(group_channel)), np.diff(group_start))
-    lists = [
-        np.flatnonzero(np.isin(group_of, used[first:after, 0]))
-        for first, after in zip(used_start[:-1], used_start[1:], strict=True)
-    ]
+    lists = [np.flatnonzero(np.isin(group_of, used[first:after, 0])) for first, after in pairwise(used_start)]
     return (
         stages.boxes,
         group_channel[group_of],

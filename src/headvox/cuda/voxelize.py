@@ -74,7 +74,9 @@ def mark(whole, real, quads, half, shape, shift, counting, cells):  # type: igno
             far = np.float32(raw)
             v, u = i // width, i % width
             x = _along_ray(transform[0, 3], far, real[frame, column + u], real[frame, row + v])
-            y = _along_ray(transform[1, 3], far, real[frame, column + width + u], real[frame, row + height + v])
+            y = _along_ray(
+                transform[1, 3], far, real[frame, column + width + u], real[frame, row + height + v]
+            )
             z = _along_ray(
                 transform[2, 3], far, real[frame, column + 2 * width + u], real[frame, row + 2 * height + v]
             )

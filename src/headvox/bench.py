@@ -396,6 +396,9 @@ def main(argv: list[str]) -> int:
         default="pose",
         help="how a head's centre is found (pose)",
     )
+    parser.add_argument(
+        "--backend", choices=("cpu", "cuda"), default="cpu", help="measure the CPU (default) or a GPU"
+    )
     parser.add_argument("--rounds", type=whole_number, metavar="N", help="rounds of calls (100)")
     parser.add_argument(
         "--quick", action="store_true", help="a few rounds on small images: only to see it work"
@@ -411,6 +414,15 @@ def main(argv: list[str]) -> int:
     def note(text: str) -> None:
         print(f"headvox bench: {text}", file=sys.stderr, flush=True)
 
+    if args.backend == "cuda":
+        from headvox.cuda.device import check_real_device
+
+        check_real_device()
+        from headvox.cuda import bench as gpu
+
+        result = gpu.bench(args.cascade, args.refine, MAX_RANGE_M, rounds, args.quick, note)
+        print(json.dumps(result, indent=1) if args.json else gpu.report(result))
+        return 0
     result = measure(args.cascade, args.refine, rounds, frames, args.quick, note)
     print(json.dumps(result, indent=1) if args.json else report(result))
     return 0

@@ -85,7 +85,8 @@ class Detector:
         self.cascade = compile_cascade(load_cascade(self.config.cascade), self.config.voxel_m)
         self.on_device = self.config.backend != "cpu" and use_device(self.config.backend)
         """Whether frames are searched on a GPU; it ends when the GPU fails."""
-        self._device: Device | None = None
+        self.device: Device | None = None
+        """What searches on the GPU, once there was a frame."""
         self.stage_ms = dict.fromkeys(DEVICE_STAGES if self.on_device else STAGES, 0.0)
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
@@ -169,12 +170,12 @@ class Detector:
         clock = _Clock(self.stage_ms)
         asked = [self._asked(frame, one) for frame, one in zip(frames, expected, strict=True)]
         try:
-            found = self._device_for(asked[0].lattice).search(asked, self._rays_of)
+            found = self._device_of(asked[0].lattice).search(asked, self._rays_of)
         except DeviceLost as error:
             self._note(
                 f"the GPU failed ({error}): this frame is done again, and all further ones, on the CPU"
             )
-            self.on_device, self._device = False, None
+            self.on_device, self.device = False, None
             self.stage_ms = dict.fromkeys(STAGES, 0.0)
             return [self.detect_frame(frame, one) for frame, one in zip(frames, expected, strict=True)]
         clock.done("search")
@@ -188,17 +189,17 @@ class Detector:
         kept = self._threshold(frame) - (self._slack() if expected is not None and len(expected) else 0)
         return Asked(frame, lattice, self._sees(frame), kept)
 
-    def _device_for(self, lattice: Lattice) -> Device:
+    def _device_of(self, lattice: Lattice) -> Device:
         if (
-            self._device is None
-            or self._device.shape != lattice.shape
-            or self._device.cascade is not self.cascade
+            self.device is None
+            or self.device.shape != lattice.shape
+            or self.device.cascade is not self.cascade
         ):
             around = AROUND[self.cascade.gate.spacing]
-            self._device = Device(
+            self.device = Device(
                 self.cascade, lattice.shape, around, MOST_PEAKS, cells_about(lattice.voxel_m)
             )
-        return self._device
+        return self.device
 
     def _refine_found(self, asked: Asked, found: Found, expected: Expected | None) -> Heads:
         """Return the heads of a frame that the device searched: from here on it is as on the CPU."""

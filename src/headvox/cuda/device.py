@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,9 @@ from headvox.data import DepthImage
 from headvox.errors import HeadvoxError
 from headvox.masks import CompiledCascade
 from headvox.voxelize import Lattice, Rays
+
+if TYPE_CHECKING:
+    from headvox.cuda.search import Search
 
 BATCH = 8  # frames that go at once, where several are known
 INSTALL = "Install numba-cuda with: pip install 'headvox[cuda]', or use the backend \"cpu\"."
@@ -63,6 +67,20 @@ def check_device() -> None:
         raise HeadvoxError('The backend "cuda" gets wrong numbers from this GPU.', 'Use the backend "cpu".')
 
 
+def check_real_device() -> None:
+    """As :func:`check_device`, and that it is no simulator: whose times mean nothing.
+
+    Raises:
+        HeadvoxError: the same, or NUMBA_ENABLE_CUDASIM is set.
+    """
+    check_device()
+    if is_simulated():
+        raise HeadvoxError(
+            "NUMBA_ENABLE_CUDASIM is set: the times of a simulated GPU mean nothing.",
+            "Unset it to measure a GPU.",
+        )
+
+
 def use_device(backend: str) -> bool:
     """Return whether a detector with this ``backend`` goes to the GPU; with "auto", if there is one.
 
@@ -97,17 +115,21 @@ class Device:
         self._searches: dict[int, Search] = {}
         self._make = partial(Search, cascade, shape, around, most_peaks, patch_reach)
 
+    def for_frames(self, count: int) -> Search:
+        """Return the search for so many frames at once."""
+        frames = 1 if count == 1 else BATCH
+        if frames not in self._searches:
+            self._searches[frames] = self._make(frames)
+        return self._searches[frames]
+
     def search(self, asked: Sequence[Asked], rays_of: Callable[[DepthImage, Lattice], Rays]) -> list[Found]:
         """Return what is found in each of ``asked``, at most :data:`BATCH` frames.
 
         Raises:
             DeviceLost: the GPU failed.
         """
-        frames = 1 if len(asked) == 1 else BATCH
         try:
-            if frames not in self._searches:
-                self._searches[frames] = self._make(frames)
-            return self._searches[frames].run(asked, rays_of)
+            return self.for_frames(len(asked)).run(asked, rays_of)
         except Exception as error:
             if not _is_of_device(error):
                 raise

@@ -52,7 +52,7 @@ class Search:
         self.counting = cascade.source.counting
         self.stream = cuda.stream()
         self._cell_type = np.dtype(np.uint32 if self.counting else np.uint8)
-        self._upload(1)
+        self._room_for_words(1)
         cells = math.prod(shape)
         self.cells = self._empty(cells if self.counting else -(-cells // 4), np.uint32)
         self.S = cuda.device_array((frames, nx + 1, ny + 1, nz + 1), np.uint32)
@@ -72,7 +72,7 @@ class Search:
     def _empty(self, count: int, dtype: npt.DTypeLike) -> Any:
         return cuda.device_array((self.frames, count), dtype)
 
-    def _upload(self, words: int) -> None:
+    def _room_for_words(self, words: int) -> None:
         """Have room for rows of so many words."""
         words = -(-words // 4) * 4
         self.host_rows = cuda.pinned_array((self.frames, words), np.int32)
@@ -124,20 +124,28 @@ class Search:
         """Return what is found in each of up to ``frames`` frames."""
         words = max(words_of(one.frame) for one in asked)
         if words > self.host_rows.shape[1]:
-            self._upload(words + words // 4)
+            self._room_for_words(words + words // 4)
         for one, row in zip(asked, self.host_rows, strict=False):
             pack(one, rays_of, row)
         sensors = max(len(one.frame.clouds) + len(one.frame.depths) for one in asked)
         while True:
-            self.whole.copy_to_device(self.host_rows, stream=self.stream)
+            self.upload()
             self.launch(len(asked), sensors)
-            self.report.copy_to_host(self.host_report, stream=self.stream)
+            self.download()
             self.stream.synchronize()
             found = [self._read(row) for row in self.host_report[: len(asked)]]
             most = max(one.candidates for one in found)
             if most <= self.candidates.shape[1]:
                 return found
             self._make_room(2 * most)  # and again: some did not fit
+
+    def upload(self) -> None:
+        """Start to copy all rows to the device."""
+        self.whole.copy_to_device(self.host_rows, stream=self.stream)
+
+    def download(self) -> None:
+        """Start to copy all reports to the host."""
+        self.report.copy_to_host(self.host_report, stream=self.stream)
 
     def launch(self, frames: int, sensors: int) -> None:
         """Start all stages for the first ``frames`` rows, which have been uploaded."""
@@ -149,37 +157,37 @@ class Search:
         self._judge(frames)
         self._report(frames)
 
-    def _on(self, items: int, frames: int, sensors: int = 1) -> tuple[Any, ...]:
+    def on(self, items: int, frames: int, sensors: int = 1) -> tuple[Any, ...]:
         """Return how to launch a kernel over so many items a frame."""
         return (min(-(-items // THREADS), MOST_BLOCKS), frames, sensors), THREADS, self.stream
 
     def _voxelize(self, frames: int, sensors: int) -> None:
         shift = self.cascade.source.subdivision - 1
-        voxelize.clear[self._on(self.passed.shape[1], frames)](
+        voxelize.clear[self.on(self.passed.shape[1], frames)](
             self.cells, self.passed, self.marked, self.counts
         )
         items = self.whole.shape[1] // 2
-        voxelize.mark[self._on(items, frames, sensors)](
+        voxelize.mark[self.on(items, frames, sensors)](
             self.whole, self.real, self.quads, self.half, self.shape, shift, self.counting, self.cells
         )
 
     def _integrate(self, frames: int) -> None:
         nx, ny, nz = (n + 1 for n in self.shape)
-        integral.sum_along_z[self._on(nx * ny, frames)](self.cells, self.counting, self.S)
-        integral.sum_along_y[self._on(nx * nz, frames)](self.S)
-        integral.sum_along_x[self._on(ny * nz, frames)](self.S)
+        integral.sum_along_z[self.on(nx * ny, frames)](self.cells, self.counting, self.S)
+        integral.sum_along_y[self.on(nx * nz, frames)](self.S)
+        integral.sum_along_x[self.on(ny * nz, frames)](self.S)
 
     def _gate(self, frames: int) -> None:
         spacing = self.cascade.gate.spacing
-        gate.gate[self._on(math.prod(self.shape), frames)](
+        gate.gate[self.on(math.prod(self.shape), frames)](
             self.S, self.whole, *self.gate, spacing, self.passed
         )
         self._compact(self.passed, suppress.CANDIDATES, self.candidates, frames)
 
     def _compact(self, bits: Any, which: int, listed: Any, frames: int) -> None:
-        compact.count_bits[self._on(SHARES, frames)](bits, self.shares)
+        compact.count_bits[self.on(SHARES, frames)](bits, self.shares)
         compact.add_up[(1, frames), ONE_BLOCK_THREADS, self.stream](self.shares, self.counts, which)
-        compact.list_bits[self._on(SHARES, frames)](bits, self.shares, listed)
+        compact.list_bits[self.on(SHARES, frames)](bits, self.shares, listed)
 
     def _vote(self, frames: int) -> None:
         votes, stages = self.cascade.votes, self.cascade.stages
@@ -189,7 +197,7 @@ class Search:
                 False, self.scores, frames,
             )  # fmt: skip
         elif votes is not None:
-            vote.vote_masks[self._on(self.candidates.shape[1], frames)](
+            vote.vote_masks[self.on(self.candidates.shape[1], frames)](
                 self.S, self.candidates, self.counts, suppress.CANDIDATES, self.votes, votes.masks,
                 votes.asymmetry_cost, votes.min_votes, self.scores, self.yaws,
             )  # fmt: skip
@@ -204,7 +212,7 @@ class Search:
         )  # fmt: skip
 
     def _suppress(self, frames: int) -> None:
-        on = self._on(self.candidates.shape[1], frames)
+        on = self.on(self.candidates.shape[1], frames)
         reach = PEAK_REACH[self.cascade.gate.spacing]
         suppress.mark_maxima[on](
             self.candidates, self.counts, self.scores, reach, self.column, self.layer, self.marked
@@ -239,7 +247,7 @@ class Search:
         )  # fmt: skip
         if stages is None or not self.sees:
             return
-        judge.look_about[self._on(self.most_peaks * len(self.offsets), frames)](
+        judge.look_about[self.on(self.most_peaks * len(self.offsets), frames)](
             self.S,
             self.whole,
             self.quads,
@@ -249,7 +257,7 @@ class Search:
             self.offsets,
             self.states,
         )
-        judge.count_states[self._on(self.most_peaks, frames)](
+        judge.count_states[self.on(self.most_peaks, frames)](
             self.whole, self.counts, self.states, self.start, self.seen
         )
         self._score(
@@ -262,7 +270,7 @@ class Search:
             self.S, self.whole, self.counts, self.judged, self.judged_places, self.judged_scores, self.yaws, self.kept,
             self.report.view(np.int64),
         )  # fmt: skip
-        judge.copy_patches[self._on(self.most_peaks * THREADS, frames)](
+        judge.copy_patches[self.on(self.most_peaks * THREADS, frames)](
             self.S, self.counts, self.cells.view(self._cell_type), self.kept, self.reach,
             self.report.view(self._cell_type), self._first_patch,
         )  # fmt: skip

@@ -123,7 +123,17 @@ def test_json_lines_are_what_the_format_says(recording: Path, anything: Path) ->
         assert isinstance(heads, list)
         assert heads
         for head in heads:
-            assert list(head) == ["id", "centre", "quaternion", "radius", "score", "velocity"]
+            wanted = [
+                "id",
+                "centre",
+                "quaternion",
+                "radius",
+                "score",
+                "velocity",
+                "centre_sigma",
+                "rotation_sigma",
+            ]
+            assert list(head) == wanted
             assert head["id"] is None
             assert head["velocity"] is None
             assert head["quaternion"] is None or abs(sum(v * v for v in head["quaternion"]) - 1.0) < 1e-4

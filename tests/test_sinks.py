@@ -11,13 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headvox.data import Heads
+from headvox.data import Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.live import Live
 from headvox.run import Report
 from headvox.sinks import Result, open_sink
 from headvox.sinks.jsonl import JsonStream, to_json
 from headvox.table import printable, table
+from headvox.track import Tracker
 
 HEADS = Heads(
     np.array([[1.00004, -2.0, -0.00001]]),
@@ -32,9 +33,30 @@ def test_a_line_of_json() -> None:
     assert to_json(RESULT) == (
         '{"stamp_ns": 123456789012345678, "frame": 7, "latency_ms": 2.1, "heads": [{"id": null, '
         '"centre": [1.0, -2.0, 0.0], "quaternion": [0.0, 0.0, 0.6, 0.8], "radius": 0.11, "score": 3.25, '
-        '"velocity": null}]}'
+        '"velocity": null, "centre_sigma": null, "rotation_sigma": null}]}'
     )
     assert '"heads": []' in to_json(Result(0, 0, 1.0, Heads()))
+
+
+def test_json_states_how_sure_a_head_is() -> None:
+    turn = np.diag(np.radians([1.0, 2.0, 30.0]) ** 2)
+    place = np.diag([0.01, 0.02, 0.0301234]) ** 2
+    tables = [
+        np.repeat(table, 2, axis=0) for table in (HEADS.centres, HEADS.quaternions, HEADS.radii, HEADS.scores)
+    ]
+    heads = Heads(*tables, np.stack([place, place]), np.stack([turn, np.full((3, 3), np.nan)]))
+    one, other = json.loads(to_json(Result(0, 0, 1.0, heads)))["heads"]
+    assert one["centre_sigma"] == other["centre_sigma"] == [0.01, 0.02, 0.0301]
+    assert one["rotation_sigma"] == [1.0, 2.0, 30.0]
+    assert other["rotation_sigma"] is None
+
+    tracker = Tracker()
+    tracked = [tracker.update(heads, Frame(stamp_ns=k * 33_000_000)) for k in range(3)][-1]
+    head = json.loads(to_json(Result(0, 0, 1.0, heads, tracked)))["heads"][0]
+    assert head["centre_sigma"] == pytest.approx(np.sqrt(np.diag(tracked.covariances[0])[:3]), abs=6e-5)
+    assert 0 < head["centre_sigma"][0] < 0.1
+    wanted = np.degrees(np.sqrt(np.diag(tracked.rotation_covariances[0])))
+    assert head["rotation_sigma"] == pytest.approx(wanted, abs=6e-3)
 
 
 @given(st.lists(st.floats(), min_size=10, max_size=10))

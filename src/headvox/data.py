@@ -207,12 +207,18 @@ class Tracks:
                 self.quaternions[n],
                 float(self.radii[n]),
                 float(self.scores[n]),
+                sigmas(self.covariances[n, :3, :3]),
+                sigmas(self.rotation_covariances[n]),
             )
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """A head as it is written: a row of :class:`Tracks`, or a bare head, without id (0), state and velocity (NaN)."""
+    """A head as it is written: a row of :class:`Tracks`, or a bare head, without id (0), state and velocity (NaN).
+
+    ``centre_sigma`` (3,) are the standard deviations of the centre, metres, world axes; ``rotation_sigma`` (3,) those
+    of the turns about the head's axes (roll, pitch, yaw), radians. NaN where not known.
+    """
 
     id: int
     state: State | None
@@ -221,3 +227,11 @@ class Track:
     quaternion: F64
     radius: float
     score: float
+    centre_sigma: F64
+    rotation_sigma: F64
+
+
+def sigmas(covariance: F64) -> F64:
+    """Return the standard deviations (N,) of a covariance (N, N)."""
+    deviations: F64 = np.sqrt(np.diagonal(covariance))
+    return deviations

@@ -37,14 +37,18 @@ class Result:
 
     def rows(self) -> Iterator[Track]:
         """Return what there is to write, a row a head: the tracks, or the bare heads where nothing is tracked."""
-        from headvox.data import Track
+        from headvox.data import Track, sigmas
 
         if self.tracks is not None:
             return iter(self.tracks)
+        heads = self.heads
         return (
-            Track(0, None, head.centre, (math.nan,) * 3, head.quaternion, head.radius, head.score)
-            for head in self.heads
-        )
+            Track(
+                0, None, head.centre, (math.nan,) * 3, head.quaternion, head.radius, head.score,
+                sigmas(heads.centre_covariances[n]), sigmas(heads.rotation_covariances[n]),
+            )
+            for n, head in enumerate(heads)
+        )  # fmt: skip
 
 
 class Sink(Protocol):

@@ -13,6 +13,7 @@ from headvox.sinks import Result
 from headvox.sinks.linefile import LineFile
 
 METRE_DIGITS = 4  # 0.1 mm, far below what any depth camera can tell
+DEGREE_DIGITS = 2
 DIGITS = 6
 
 
@@ -47,7 +48,10 @@ class JsonFile:
 
 
 def to_json(result: Result) -> str:
-    """Return ``result`` as a line of JSON: metres to 0.1 mm, others to 1e-6, what is unknown as null."""
+    """Return ``result`` as a line of JSON: unknown values as null.
+
+    Metres are told to 0.1 mm, degrees to 0.01, others to 1e-6.
+    """
     return json.dumps(
         {
             "stamp_ns": result.stamp_ns,
@@ -67,6 +71,8 @@ def _head(row: Track) -> dict[str, object]:
         "radius": number(row.radius, METRE_DIGITS),
         "score": number(row.score, DIGITS),
         "velocity": _numbers(row.velocity, METRE_DIGITS),
+        "centre_sigma": _numbers(row.centre_sigma, METRE_DIGITS),
+        "rotation_sigma": _numbers(map(math.degrees, row.rotation_sigma), DEGREE_DIGITS),
     }
     if row.state is not None:
         head["state"] = row.state.name.lower()

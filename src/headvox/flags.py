@@ -54,6 +54,7 @@ def source_options_of(args: argparse.Namespace) -> SourceOptions:
     return SourceOptions(
         topics=tuple(args.topic),
         frame=args.frame,
+        extrinsics=args.extrinsics,
         T_world_mount=None if args.mount is None else mount(*args.mount),
     )
 
@@ -107,7 +108,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="SOURCE",
         help="a depth recording (folder), a bag of ROS 1 or 2 (.bag, .mcap, sqlite3), a ply, pcd, npy or npz file, "
-        "or a folder of those; without it, the sample recording that ships with headvox",
+        "a folder of those, or realsense:[SERIAL,...]; without it, the sample recording that ships with headvox",
     )
     parser.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
     parser.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
@@ -116,7 +117,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each thing that a bag may not tell by itself."""
-    group = parser.add_argument_group("bags", "what a bag does not tell by itself")
+    group = parser.add_argument_group("bags and cameras", "what they do not tell by themselves")
     group.add_argument(
         "--topic", action="append", default=[], metavar="NAME", help="read this topic (again for another)"
     )
@@ -127,6 +128,9 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
         type=number,
         metavar=("X", "Y", "Z", "ROLL", "PITCH", "YAW"),
         help="where that frame, or the one sensor, stands: metres and degrees; PITCH above 0 looks down",
+    )
+    group.add_argument(
+        "--extrinsics", metavar="FILE", help="TOML or JSON that tells where each RealSense camera stands"
     )
 
 

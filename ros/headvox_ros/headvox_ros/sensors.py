@@ -14,10 +14,10 @@ from tf2_msgs.msg import TFMessage
 
 from headvox.data import Cloud, DepthImage, Frame
 from headvox.errors import HeadvoxError
+from headvox.latest import Latest
 from headvox.ros.messages import cloud_points, depth_image, intrinsics, stamp_ns
 from headvox.ros.synchronise import NS, Reading, Synchroniser
 from headvox.ros.transforms import NoTransform, TransformBuffer, set_from
-from headvox_ros.latest import Latest
 from headvox_ros.statistics import Statistics
 
 RELIABILITIES = {"best_effort": ReliabilityPolicy.BEST_EFFORT, "reliable": ReliabilityPolicy.RELIABLE}

@@ -45,11 +45,13 @@ def open_source(
 
     A folder with a ``recording.json`` (or that file itself) is a depth recording; a folder with a ``metadata.yaml``, or
     a file that begins like one, is a bag of ROS 1 or ROS 2; any other folder is a sequence of point-cloud files in
-    natural order of their names, 1/30 s apart, and a file is one cloud: ply, pcd, npy or npz.
+    natural order of their names, 1/30 s apart, and a file is one cloud: ply, pcd, npy or npz. A bag that the SDK of
+    RealSense recorded is played by it. ``realsense:`` is the camera that is plugged in, ``realsense:SERIAL,SERIAL``
+    are several.
 
     Args:
-        path: of a file or a folder.
-        options: what a bag does not tell by itself; other sources take none.
+        path: of a file or a folder, or ``realsense:``.
+        options: what a bag or a camera does not tell by itself; other sources take none.
         say: told what is assumed about a bag, a line each; by default these are warnings.
 
     Raises:
@@ -64,12 +66,15 @@ def open_source(
     from headvox.sources.recording import FILE, RecordingSource
 
     place = Path(path)
+    if os.fspath(path).startswith("realsense:") and not place.exists():
+        from headvox.sources.realsense import RealSenseLive
+
+        serials = [serial for serial in os.fspath(path).partition(":")[2].split(",") if serial]
+        return RealSenseLive(serials, options or SourceOptions(), say or _warn)
     try:
         is_recording = place.name == FILE or (place / FILE).is_file()
         if not is_recording and is_bag(place):
-            from headvox.sources.bag import BagSource
-
-            return BagSource(place, options or SourceOptions(), say or _warn)
+            return _open_bag(place, options or SourceOptions(), say or _warn)
         check_unused(options, place.name)
         if place.is_dir():
             return RecordingSource(place) if is_recording else FolderSource(place)
@@ -78,6 +83,18 @@ def open_source(
     except ValueError as error:  # a NUL in the path
         raise HeadvoxError(f"{place}: cannot be read: {error}.", "Check the path.") from None
     return RecordingSource(place.parent) if is_recording else CloudFileSource(place)
+
+
+def _open_bag(place: Path, options: SourceOptions, say: Callable[[str], None]) -> Source:
+    from headvox.ros.bagfile import Bag
+    from headvox.sources.bag import BagSource
+    from headvox.sources.realsense import RealSenseFile, is_recorded
+
+    bag = Bag(place)
+    if is_recorded(bag.topics):
+        bag.close()
+        return RealSenseFile(place, options, say)
+    return BagSource(bag, options, say)
 
 
 def _warn(text: str) -> None:

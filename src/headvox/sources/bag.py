@@ -6,7 +6,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from headvox.data import F64, BadFrame, Cloud, DepthImage, Frame
@@ -52,13 +51,17 @@ class BagSource:
 
     length: int | None
 
-    def __init__(self, place_of_bag: Path, options: SourceOptions, say: Callable[[str], None]) -> None:
-        """Open a bag and decide what is read, and in which frame; ``say`` is told what is assumed.
+    def __init__(self, bag: Bag, options: SourceOptions, say: Callable[[str], None]) -> None:
+        """Decide what of an open bag is read, and in which frame; ``say`` is told what is assumed.
 
         Raises:
             HeadvoxError: the bag cannot be read; :class:`~headvox.errors.Undecided` where the user has to choose.
         """
-        self.bag = Bag(place_of_bag)
+        if options.extrinsics is not None:
+            raise HeadvoxError(
+                f"{bag.name}: --extrinsics is for cameras, a bag has transforms.", "Use --mount."
+            )
+        self.bag = bag
         self.name = self.bag.name
         try:
             self.sensors = find_sensors(self.bag, options)

@@ -1,7 +1,7 @@
 import threading
 import time
 
-from headvox_ros.latest import Latest
+from headvox.latest import Latest
 
 
 def test_the_newest_wins_and_the_others_are_counted():

@@ -192,6 +192,26 @@ def test_heads_are_where_it_says_within_what_it_states(views):
         assert poses.coverages[0] > 0.9
 
 
+def test_the_back_of_a_head_knows_its_centre_and_not_its_yaw(views):
+    sigmas = []
+    for k in range(5):
+        view = portrait((0x7E57, 100 + k), 2.0, np.pi + 0.1 * (k - 2), posture="standing")
+        off = np.random.default_rng(k).normal(size=3)
+        poses = fitted(view.frame, view.head.centre + 0.04 * off / np.linalg.norm(off))
+        error = poses.centres[0] - view.head.centre
+        assert np.linalg.norm(error) < 0.03
+        assert (
+            error @ np.linalg.solve(poses.centre_covariances[0], error) < 16.3
+        )  # one in a thousand is farther
+        assert np.sqrt(np.trace(poses.centre_covariances[0])) < 0.05
+        sigmas.append(np.degrees(np.sqrt(poses.rotation_covariances[0, 2, 2])))
+        assert np.isnan(poses.quaternions[0]).all() == np.isnan(sigmas[-1])
+    faces = [fitted(view.frame, start).rotation_covariances[0, 2, 2] for view, start in views]
+    assert np.isnan(sigmas).any()  # some do not say at all where the face is, and
+    assert np.nanmin(sigmas) > 25.0  # the others that they hardly know
+    assert np.degrees(np.sqrt(max(faces))) < 15.0
+
+
 def test_a_shell_is_found_however_it_is_turned():
     shell = make_shell(sample_identities(3, 11)[1], False)
     points = spread_points(shell.vertices, shell.faces, 1500, np.random.default_rng(0)) @ HEADVOX_TO_PAPER

@@ -25,8 +25,8 @@ from headvox.kernels import Threads
 from headvox.pose import fit_poses
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
-from headvox.synth.processes import in_processes
 from headvox.synth.spread import spread_points
+from headvox.workers import Workers
 
 EVALUATION = 0xE7A1
 KINDS = {
@@ -135,7 +135,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     args = parser.parse_args()
     jobs = [(kind, number) for number in range(args.views) for kind in KINDS]
-    results = [r for r in in_processes(one_view, jobs, args.workers) if r is not None]
+    results = [r for r in Workers(args.workers).map(one_view, jobs) if r is not None]
     usual = [r for r in results if r["hard"] is None]
     print("| view | heads | centre mm | angle deg | gross | stated | to 15 deg | of these right |")
     print("| --- " * 8 + "|")
@@ -152,7 +152,7 @@ def main() -> None:
     if args.turns:
         shells = [
             r
-            for some in in_processes(partial(one_shell, turns=args.turns), range(44), args.workers)
+            for some in Workers(args.workers).map(partial(one_shell, turns=args.turns), range(44))
             for r in some
         ]
         print("\n" + row(f"{len(shells)} shells, any rotation", shells), f"{spread(shells, 'ms')} ms")

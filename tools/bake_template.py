@@ -36,9 +36,9 @@ from headvox.settle import fit_head
 from headvox.synth.people import PosedBody, pose_person, sample_person, sample_pose
 from headvox.synth.people import _rest as rest
 from headvox.synth.portraits import portrait
-from headvox.synth.processes import in_processes
 from headvox.synth.rays import Mesh, look
 from headvox.template import load_template
+from headvox.workers import Workers
 
 TRAINING = 0x7E3A1
 POSTURES = ("standing", "walking", "sitting", "bending", "crouching", "lying")
@@ -235,12 +235,12 @@ def main() -> None:
             asset = {name: known[name] for name in known.files}
     else:
         size_m = mean_size_m(args.people)
-        made = list(in_processes(partial(head_of, size_m=size_m), range(args.people), args.workers))
+        made = list(Workers(args.workers).map(partial(head_of, size_m=size_m), range(args.people)))
         print(f"mean size {size_m:.4f} m, log scale sigma {np.std([scale for _, scale in made]):.3f}")
         asset = quantised(learn(np.array([distance for distance, _ in made]), args.modes))
         asset |= {"size_m": np.array(size_m), "calibration": np.ones(3)}
         np.savez_compressed(args.out, **asset)
-    fits = list(in_processes(odds_and_errors, range(args.views), args.workers))
+    fits = list(Workers(args.workers).map(odds_and_errors, range(args.views)))
     asset["calibration"] = calibration([fit for fit in fits if fit is not None])
     print("temperature, shift factor, turn factor:", asset["calibration"].round(2).tolist())
     np.savez_compressed(args.out, **asset)

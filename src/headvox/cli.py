@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from headvox import __version__, masks_command
 from headvox.errors import HeadvoxError, Undecided
@@ -30,12 +31,17 @@ from headvox.flags import (
     add_tracker_settings,
     config_of,
     keep_input,
+    place,
     source_options_of,
     tracker_config_of,
 )
 from headvox.render import command as render_command
 from headvox.sinks import SUFFIXES
 from headvox.table import printable, table
+from headvox.workers import add_flags, of_flags
+
+if TYPE_CHECKING:
+    from headvox.batch import Done
 
 # Commands that read their own flags: `headvox NAME ...` is main([...]) of a module, which returns the code.
 MODULES = {
@@ -142,6 +148,10 @@ def _forget_stdout() -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.into is not None:
+        return _run_batch(args)
+    if args.more:
+        raise UsageError("several sources go with --into DIR, which gets a file of each")
     if args.no_track and args.output is not None and args.output.suffix == ".tum":
         raise UsageError("-o NAME.tum writes a file a track: it does not go with --no-track")
     from headvox.session import opened
@@ -164,6 +174,37 @@ def _run(args: argparse.Namespace) -> int:
     if not args.json:
         print(summary(report))
     return INTERRUPTED if report.interrupted else GOOD
+
+
+def _run_batch(args: argparse.Namespace) -> int:
+    if args.json or args.output is not None or args.strict or args.limit or args.source is None:
+        raise UsageError(
+            "--into goes with one SOURCE or more, and with none of --json, -o, --strict and --limit"
+        )
+    from headvox.batch import Settings, run_batch
+    from headvox.live import Live
+
+    places = [str(place) for place in (args.source, *args.more)]
+    tracker = None if args.no_track else tracker_config_of(args)
+    settings = Settings(args.into, config_of(args), source_options_of(args), tracker)
+    rows = []
+    with closing(Live(sys.stderr, None)) as live:
+
+        def tell(done: Done) -> None:
+            rows.append([done.name, str(done.frames), str(done.heads), str(done.bad), _how(done)])
+            if done.failure:
+                live.note(f"headvox: {done.name}: {done.failure}")
+            live.show(f"{len(rows)} of {len(places)} done")
+
+        every = run_batch(places, settings, of_flags(args), tell)
+    print(table(["recording", "frames", "heads", "bad frames", ""], rows))
+    return KNOWN_ERROR if any(done.failure for done in every) else GOOD
+
+
+def _how(done: Done) -> str:
+    if done.failure:
+        return "failed"
+    return "was there already" if done.was_there else "done"
 
 
 def _convert(args: argparse.Namespace) -> int:
@@ -252,6 +293,14 @@ def _parser() -> argparse.ArgumentParser:
         commands, "run", _run, "find heads in a recording, a bag, a cloud, or a folder of clouds"
     )
     add_source(run)
+    run.add_argument("more", nargs="*", type=place, metavar="SOURCE", help="more of them, with --into")
+    run.add_argument(
+        "--into",
+        type=Path,
+        metavar="DIR",
+        help="write NAME.jsonl of each source there; what is there already is not done again",
+    )
+    add_flags(run, 1)
     run.add_argument("--json", action="store_true", help="print one JSON object a frame, and nothing else")
     run.add_argument(
         "-o",
@@ -267,7 +316,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_settings(run)
     add_tracker_settings(run)
-    run.usage = "%(prog)s [SOURCE] [--json] [-o OUT] [flags]"
+    run.usage = (
+        "%(prog)s [SOURCE] [--json] [-o OUT] [flags]\n       %(prog)s SOURCE [SOURCE ...] --into DIR [flags]"
+    )
 
     info = add_command(commands, "info", _info, "tell what a source holds")
     info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")

@@ -105,7 +105,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         nargs="?",
-        type=Path,
+        type=place,
         metavar="SOURCE",
         help="a depth recording (folder), a bag of ROS 1 or 2 (.bag, .mcap, sqlite3), a ply, pcd, npy or npz file, "
         "a folder of those, or realsense:[SERIAL,...]; without it, the sample recording that ships with headvox",
@@ -113,6 +113,13 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--strict", action="store_true", help="stop at the first bad frame, with exit code 1")
     parser.add_argument("--limit", type=whole_number, metavar="N", help="stop after N frames")
     add_source_options(parser)
+
+
+def place(text: str) -> Path | str:
+    """Return a path, or the address of what lies elsewhere as it is, for argparse."""
+    from headvox.sources.remote import is_remote
+
+    return text if is_remote(text) else Path(text)
 
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:

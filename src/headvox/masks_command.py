@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from headvox.errors import HeadvoxError
 from headvox.flags import GOOD, add_command, seed_number, whole_number
 from headvox.table import printable, table
+from headvox.workers import add_flags, of_flags
 
 if TYPE_CHECKING:
     from headvox.flags import Commands
@@ -38,7 +39,7 @@ def add_to(commands: Commands) -> None:
     search.add_argument(
         "--rounds", type=whole_number, default=3, metavar="N", help="of hard negatives, at most (3)"
     )
-    search.add_argument("--workers", type=whole_number, default=1, metavar="N", help="processes (1)")
+    add_flags(search, 1)
     search.add_argument("--name", default="evolved", help="of the cascade (evolved)")
     search.add_argument(
         "--work",
@@ -88,7 +89,7 @@ def _masks_evolve(args: argparse.Namespace) -> int:
     out = args.output or Path(f"{args.name}.toml")
     if out.exists():
         raise HeadvoxError(f"{out}: exists already.", "Give another file with -o, or move it away.")
-    settings = Settings(args.work, args.views, args.name, args.seed, args.rounds, args.workers)
+    settings = Settings(args.work, args.views, args.name, args.seed, args.rounds, of_flags(args))
     found = evolve(settings, lambda text: print(text, file=sys.stderr, flush=True))
     write_cascade(out, args.name, found)
     print(printable(str(out)))

@@ -18,6 +18,7 @@ from headvox.run import Report, run
 from headvox.sinks import Result, Sink
 from headvox.sources import Source, open_source
 from headvox.sources.recording import RecordingSource
+from headvox.sources.remote import fetched
 from headvox.track import Tracker
 from headvox.warmup import warm_up
 
@@ -70,8 +71,8 @@ def opened(args: argparse.Namespace, track: bool = True) -> Iterator[Session]:
         HeadvoxError: a source or settings that cannot be used.
     """
     config, tracker_config = config_of(args), tracker_config_of(args)
-    path = args.source or sample_folder()
     with ExitStack() as stack:
+        path = stack.enter_context(fetched(args.source)) if args.source else sample_folder()
         notes: list[str] = []
         source = stack.enter_context(closing(open_source(path, source_options_of(args), notes.append)))
         live = stack.enter_context(closing(Live(sys.stderr, source.length)))

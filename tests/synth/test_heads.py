@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from headvox.errors import HeadvoxError
 from headvox.synth.heads import EYE_DISTANCE_M, RANGES, make_heads, make_shell, ply_bytes, sample_identities
+from headvox.workers import Workers
 
 
 def digest(folder) -> str:
@@ -67,7 +68,7 @@ def test_points_are_spread_evenly(small):
 
 
 def test_two_workers_write_the_same_bytes_and_a_stopped_run_goes_on(small, tmp_path):
-    make_heads(tmp_path, count=3, points=600, seed=5, workers=2)
+    make_heads(tmp_path, count=3, points=600, seed=5, workers=Workers(2))
     assert digest(tmp_path) == digest(small)
     (tmp_path / "head_01.ply").unlink()
     (tmp_path / "manifest.json").unlink()

@@ -7,6 +7,7 @@ seen from eight sides by one simulated Kinect, on a floor and before a wall.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def around(folder: Path, seed: int = 0) -> Scenario:
                 f"Expected {', '.join(f'{n}.ply' for n in HEADS_M)}.",
             )
     count = VIEWS * len(HEADS_M)
-    return Scenario("peers", count, lambda: _views(folder, seed), synthetic=False, moving=False, rules=RULES)
+    return Scenario("peers", count, partial(_views, folder, seed), synthetic=False, moving=False, rules=RULES)
 
 
 def _views(folder: Path, seed: int) -> Iterator[Labelled]:

@@ -6,9 +6,10 @@ import argparse
 import os
 import platform
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,11 +27,11 @@ from headvox.flags import (
 )
 from headvox.live import Live
 from headvox.table import printable
+from headvox.workers import Workers, add_flags, of_flags
 
 if TYPE_CHECKING:
-    from headvox.config import DetectorConfig
-    from headvox.evaluate.loop import Finder, Run
     from headvox.evaluate.match import Rules
+    from headvox.evaluate.outcome import Outcome, Plan
     from headvox.evaluate.report import Limit, Report
     from headvox.evaluate.scenarios import Scenario
     from headvox.evaluate.scores import Scores
@@ -85,25 +86,42 @@ def _compare(argv: Sequence[str]) -> int:
 
 
 def _report(args: argparse.Namespace) -> int:
-    from headvox.evaluate.match import Rules
+    from headvox.evaluate.outcome import evaluate, evaluate_all, pooled
+    from headvox.evaluate.plots import need_matplotlib
     from headvox.evaluate.report import Report
+    from headvox.evaluate.truth import NO_ID
 
-    rules = Rules(args.radius, args.clear, args.count_truncated)
-    configs = [config_of(args)]
-    configs += [replace(configs[0], cascade=name) for name in args.against]
-    made = _made(configs, rules, args)  # what is wrong with a cascade, or with the folder, is told now
+    plan = _plan(args)
+    made = _made(plan, args)  # what is wrong with a cascade, or with the folder, is told now
     if args.output is not None:
+        need_matplotlib()
         args.output.mkdir(parents=True, exist_ok=True)
     scores: list[Scores] = []
-    runs: list[tuple[Scenario, Scores, Run]] = []
+    recorded: dict[str, list[Outcome]] = {}
     with closing(Live(sys.stderr, None)) as live:
-        for scenario in _scenarios(args, live):
-            for several, run in _evaluate(scenario, configs, args, scenario.rules or rules, live):
-                scores += several
-                runs.append((scenario, several[0], run))
+        scenarios = _scenarios(args, live)
+        if args.scheduler is None:
+            # One after the other, each told of as it goes: whoever times a detector has the machine to himself.
+            outcomes: Iterable[tuple[Scenario, list[Outcome]]] = (
+                (scenario, evaluate(scenario, plan, partial(_show, live, scenario))) for scenario in scenarios
+            )
+        else:
+            told = f"of {len(scenarios)} recordings"
+            outcomes = evaluate_all(
+                scenarios, plan, of_flags(args), lambda count: live.show(f"{count} {told}")
+            )
+        for scenario, several in outcomes:
+            _tell_bad(scenario, several[0], live)
+            scores += [entry for outcome in several for entry in outcome.scores]
+            if args.output is not None:
+                _picture(scenario, several, plan.rules_of(scenario), args.output)
+            for outcome in several:
+                if scenario.recording and (outcome.run.samples[0].found.ids == NO_ID).all():
+                    recorded.setdefault(outcome.scores[0].detector, []).append(outcome)
+    scores += [row for row in (pooled(those, plan.rules) for those in recorded.values()) if row is not None]
     report = Report(tuple(scores), made)
     if args.output is not None:
-        _write(report, runs, rules, args.output)
+        report.save(args.output / "report.json")
     print(report.to_json() if args.json else _text(report, args.details))
     missed = [line for limit in args.limit for line in limit.missed(report)]
     for line in missed:
@@ -111,11 +129,38 @@ def _report(args: argparse.Namespace) -> int:
     return LIMIT_MISSED if missed else GOOD
 
 
+def _plan(args: argparse.Namespace) -> Plan:
+    from headvox.evaluate.match import Rules
+    from headvox.evaluate.outcome import Plan
+
+    config = config_of(args)
+    return Plan(
+        configs=(config, *(replace(config, cascade=name) for name in args.against)),
+        tracker=None if args.no_track else tracker_config_of(args),
+        rules=Rules(args.radius, args.clear, args.count_truncated),
+        heads=args.heads,
+        name=args.name,
+        pictures=args.output is not None,
+    )
+
+
+def _show(live: Live, scenario: Scenario, number: int) -> None:
+    live.show(f"{scenario.name}: frame {number} of {scenario.length}")
+
+
+def _tell_bad(scenario: Scenario, outcome: Outcome, live: Live) -> None:
+    run = outcome.run
+    if run.bad:
+        what = f"{run.bad} of {len(run.samples)} frames could not be used: their heads are missed"
+        live.note(f"headvox: {scenario.name}: {what}")
+
+
 def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
     """Return what was asked for, in the order given."""
     from headvox.evaluate import scenarios as known
     from headvox.evaluate.around import around
     from headvox.evaluate.keep import keep
+    from headvox.sources.remote import is_remote
 
     asked = [name for what in args.what for name in (ALL if what == "all" else (what,))]
     made: list[Scenario] = []
@@ -129,7 +174,9 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
             ]
         elif what == "two-cameras":
             made.append(
-                known.two_cameras(args.walkers, args.frames, args.people, 100 + args.seed, args.workers)
+                known.two_cameras(
+                    args.walkers, args.frames, args.people, 100 + args.seed, Workers(args.workers)
+                )
             )
         elif what == "sample":
             made.append(replace(known.recording(sample_folder()), synthetic=True))
@@ -138,7 +185,7 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
                 raise UsageError("peers needs --clouds FOLDER, with the four meshes of the paper's authors")
             made.append(around(args.clouds))
         else:
-            scenario = known.recording(Path(what))
+            scenario = known.remote_recording(what) if is_remote(what) else known.recording(Path(what))
             is_known = scenario.name in [other.name for other in made]
             made.append(replace(scenario, name=what) if is_known else scenario)
     if args.keep is not None:
@@ -152,59 +199,7 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
     return made
 
 
-def _evaluate(
-    scenario: Scenario, configs: Sequence[DetectorConfig], args: argparse.Namespace, rules: Rules, live: Live
-) -> list[tuple[list[Scores], Run]]:
-    """Return the scores of each finder on a scenario, and what it found."""
-    from headvox.evaluate.loop import go_over
-
-    with ExitStack() as stack:
-        finders = _finders(scenario, configs, args, stack)
-        runs = go_over(
-            scenario, finders, rules, lambda k: live.show(f"{scenario.name}: frame {k} of {scenario.length}")
-        )
-    if runs[0].bad:
-        what = f"{runs[0].bad} of {scenario.length} frames could not be used: their heads are missed"
-        live.note(f"headvox: {scenario.name}: {what}")
-    return [(_scores(scenario, finder, run, rules), run) for finder, run in zip(finders, runs, strict=True)]
-
-
-def _finders(
-    scenario: Scenario, configs: Sequence[DetectorConfig], args: argparse.Namespace, stack: ExitStack
-) -> list[Finder]:
-    """Return what is to look at a scenario: another program's lines, or each cascade, bare and with a tracker."""
-    from headvox.evaluate.found import read_found
-    from headvox.evaluate.loop import bare, tracked, written
-
-    if args.heads is not None:
-        stamps = {frame.stamp_ns for frame, _ in scenario.frames()}
-        return [written(args.name or args.heads.stem, read_found(args.heads), stamps)]
-    finders = []
-    for config in configs:
-        finders.append(bare(config, stack))
-        if scenario.moving and scenario.length != 1 and not args.no_track:
-            finders.append(tracked(config, tracker_config_of(args), stack))
-    return finders
-
-
-def _scores(scenario: Scenario, finder: Finder, run: Run, rules: Rules) -> list[Scores]:
-    """Return the scores on all frames, and those on the frames kept aside where some were not."""
-    from headvox.evaluate.heldout import tuned_frames, word
-    from headvox.evaluate.scores import score
-
-    labelled = [sample for sample in run.samples if sample.true is not None]
-    if finder.tuned_on is None:
-        return [score(scenario.name, finder.name, run.samples, rules)]
-    used = tuned_frames(finder.tuned_on, scenario.recording, len(labelled))
-    tuned = word(used, finder.tuned_on, scenario.synthetic)
-    scores = [score(scenario.name, finder.name, run.samples, rules, tuned)]
-    if used.any() and not used.all():
-        aside = [sample for sample, was_used in zip(labelled, used, strict=True) if not was_used]
-        scores.append(score(f"{scenario.name}, kept aside", finder.name, aside, rules, "no"))
-    return scores
-
-
-def _made(configs: Sequence[DetectorConfig], rules: Rules, args: argparse.Namespace) -> dict[str, Any]:
+def _made(plan: Plan, args: argparse.Namespace) -> dict[str, Any]:
     """Return how the report was made."""
     import numba
     import numpy
@@ -218,12 +213,12 @@ def _made(configs: Sequence[DetectorConfig], rules: Rules, args: argparse.Namesp
         "numba": numba.__version__,
         "machine": platform.machine(),
         "cores": os.cpu_count(),
-        "rules": asdict(rules),
+        "rules": asdict(plan.rules),
     }
     if args.heads is None:  # else nobody knows
-        made["settings"] = [asdict(config) for config in configs]
-        made["tracker"] = None if args.no_track else asdict(tracker_config_of(args))
-        made["tuned_on"] = {c.cascade: list(load_cascade(c.cascade).tuned_on) for c in configs}
+        made["settings"] = [asdict(config) for config in plan.configs]
+        made["tracker"] = None if plan.tracker is None else asdict(plan.tracker)
+        made["tuned_on"] = {c.cascade: list(load_cascade(c.cascade).tuned_on) for c in plan.configs}
     return made
 
 
@@ -237,23 +232,19 @@ def _text(report: Report, details: bool) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _write(report: Report, runs: Sequence[tuple[Scenario, Scores, Run]], rules: Rules, folder: Path) -> None:
-    """Write report.json, and then pictures: of each scenario, and of what went wrong there."""
+def _picture(scenario: Scenario, outcomes: Sequence[Outcome], rules: Rules, folder: Path) -> None:
+    """Draw what the detectors made of a scenario, and what went wrong there."""
     from headvox.evaluate.pictures import picture_mishaps
-    from headvox.evaluate.plots import need_matplotlib, plot_scenario
+    from headvox.evaluate.plots import plot_scenario
     from headvox.plot_masks import file_name
 
-    report.save(folder / "report.json")
-    need_matplotlib()
-    for name in dict.fromkeys(scenario.name for scenario, _, _ in runs):
-        those = [(scores, run) for scenario, scores, run in runs if scenario.name == name]
-        own = next(scenario.rules for scenario, _, _ in runs if scenario.name == name)
-        plot_scenario(those, own or rules, folder / f"{file_name(name)}.png")
-        for scores, run in those:
-            for kind, mishaps in (("misses", run.misses), ("false", run.false)):
-                if mishaps:
-                    stem = file_name(f"{name} {scores.detector} {kind}")
-                    picture_mishaps(f"{scores.name}: worst {kind}", mishaps, folder / f"{stem}.png")
+    those = [(outcome.scores[0], outcome.run) for outcome in outcomes]
+    plot_scenario(those, rules, folder / f"{file_name(scenario.name)}.png")
+    for scores, run in those:
+        for kind, mishaps in (("misses", run.misses), ("false", run.false)):
+            if mishaps:
+                stem = file_name(f"{scenario.name} {scores.detector} {kind}")
+                picture_mishaps(f"{scores.name}: worst {kind}", mishaps, folder / f"{stem}.png")
 
 
 # -------------------------------------------------------------------------------------------------- flags
@@ -318,7 +309,6 @@ def _parser() -> argparse.ArgumentParser:
         ("walkers", 4, "two-cameras: scenes, each with people of its own"),
         ("frames", 60, "two-cameras: frames of each scene, 10 a second"),
         ("people", 1, "two-cameras: people at a time"),
-        ("workers", os.cpu_count() or 1, "two-cameras: processes that make the images"),
     ):
         scenes.add_argument(
             f"--{name}", type=whole_number, default=usual, metavar="N", help=f"{text} ({usual})"
@@ -329,6 +319,7 @@ def _parser() -> argparse.ArgumentParser:
     scenes.add_argument(
         "--seed", type=not_negative, default=0, metavar="N", help="another number, other heads and people (0)"
     )
+    add_flags(parser)
     add_settings(parser)
     return parser
 

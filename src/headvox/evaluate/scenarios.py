@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from headvox.data import F64, BadFrame, Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.evaluate.match import Rules
 from headvox.evaluate.truth import FILE, TrueHeads, read_truth
+from headvox.workers import ALONE, Workers
 
 if TYPE_CHECKING:
     from headvox.synth.scene import TrueHead
@@ -96,7 +98,7 @@ def _turned(shell: F64, turn: Rotation, stamp_ns: int, person: int | None) -> La
 
 
 def two_cameras(
-    walkers: int = 4, frames: int = RIG_FRAMES, people: int = 1, seed: int = 100, workers: int = 1
+    walkers: int = 4, frames: int = RIG_FRAMES, people: int = 1, seed: int = 100, workers: Workers = ALONE
 ) -> Scenario:
     """The paper's scenario III: an avatar walks between two D435i 4 m apart; several avatars, one after another.
 
@@ -106,9 +108,8 @@ def two_cameras(
     return Scenario("two-cameras", walkers * frames, make, synthetic=True)
 
 
-def _two_cameras(walkers: int, frames: int, people: int, seed: int, workers: int) -> Iterator[Labelled]:
+def _two_cameras(walkers: int, frames: int, people: int, seed: int, workers: Workers) -> Iterator[Labelled]:
     from headvox.synth.presets import two_cameras as stage
-    from headvox.synth.processes import in_processes
     from headvox.synth.record import stamps
 
     doing = (("walking", "walk"), ("sitting", "stay"), ("standing", "turn"))
@@ -119,7 +120,7 @@ def _two_cameras(walkers: int, frames: int, people: int, seed: int, workers: int
         every = stamps(frames, RIG_RATE_HZ)
         for first in range(0, frames, AT_ONCE):
             # All of them before the first is looked at: whoever times a detector is not to compete with this.
-            made = list(in_processes(scene.frame, every[first : first + AT_ONCE], workers))
+            made = list(workers.map(scene.frame, every[first : first + AT_ONCE]))
             for frame, heads in made:
                 stamp_ns = frame.stamp_ns + later
                 true = TrueHeads.of(stamp_ns, [_row(head, 10_000 * walker) for head in heads])
@@ -148,22 +149,45 @@ def recording(path: Path) -> Scenario:
     """
     from headvox.sources import open_source
 
+    _truth_of(path)
+    source = open_source(path)
+    source.close()
+    return Scenario(
+        source.name,
+        source.length or 0,
+        partial(_recorded, path.absolute()),
+        synthetic=False,
+        recording=source.name,
+    )
+
+
+def _truth_of(path: Path) -> dict[int, TrueHeads]:
     folder = path if path.is_dir() else path.parent
     if not (folder / FILE).is_file():
         raise HeadvoxError(
             f"{path}: there is no {FILE} beside it, so nobody knows where the heads are.",
             "docs/conventions.md describes the file.",
         )
-    source = open_source(path)
-    truth = read_truth(folder / FILE)
+    return read_truth(folder / FILE)
 
-    def frames() -> Iterator[Labelled]:
-        reading = open_source(path)
-        try:
-            for frame in reading:
-                yield frame, truth.get(frame.stamp_ns)
-        finally:
-            reading.close()
 
-    source.close()
-    return Scenario(source.name, source.length or 0, frames, synthetic=False, recording=source.name)
+def _recorded(path: Path) -> Iterator[Labelled]:
+    from headvox.sources import open_source
+
+    truth = _truth_of(path)
+    with closing(open_source(path)) as reading:
+        for frame in reading:
+            yield frame, truth.get(frame.stamp_ns)
+
+
+def remote_recording(address: str) -> Scenario:
+    """Return a recording that lies elsewhere (:mod:`headvox.sources.remote`), fetched when its frames are asked for."""
+    name = address.rstrip("/").rsplit("/", 1)[-1]
+    return Scenario(name, 0, partial(_fetched, address), synthetic=False, recording=name)
+
+
+def _fetched(address: str) -> Iterator[Labelled]:
+    from headvox.sources.remote import fetched
+
+    with fetched(address) as path:
+        yield from _recorded(path)

@@ -40,7 +40,7 @@ from headvox.masks import (
     compile_cascade,
     parse_cascade,
 )
-from headvox.synth.processes import in_processes
+from headvox.workers import ALONE, Workers
 
 GATE_VIEWS = 3000
 GATE_LOSES, TIGHT_GATE_LOSES = 0.03, 0.004
@@ -58,7 +58,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Settings:
-    """What to search with: ``views`` of ``seed``, kept in the folder ``work``, in so many processes."""
+    """What to search with: ``views`` of ``seed``, kept in the folder ``work``; the ``workers`` do it."""
 
     work: Path
     views: int
@@ -66,7 +66,7 @@ class Settings:
     seed: int = 0
     rounds: int = 3
     """Of the judge, at most: it ends when a round has not helped."""
-    workers: int = 1
+    workers: Workers = ALONE
 
 
 def evolve(settings: Settings, say: Say) -> Found:
@@ -202,9 +202,7 @@ def _compile_gate(gate: tuple[Condition, ...]) -> CompiledGate:
 
 def _of_views(settings: Settings, take: Callable[[View], Made], most: int | None = None) -> Iterator[Made]:
     numbers = range(min(settings.views, most or settings.views))
-    yield from in_processes(
-        partial(_take, settings.work / "views", settings.seed, take), numbers, settings.workers
-    )
+    yield from settings.workers.map(partial(_take, settings.work / "views", settings.seed, take), numbers)
 
 
 def _take(folder: Path, seed: int, take: Callable[[View], Made], number: int) -> Made:

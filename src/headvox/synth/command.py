@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from headvox.live import Live
 from headvox.table import printable, table
+from headvox.workers import add_flags, of_flags
 
 if TYPE_CHECKING:
     from headvox.synth.scene import Scene
@@ -27,7 +27,7 @@ examples:
   headvox synth scene --sensor lidar -o clouds   a folder of clouds
 
 A command that was stopped goes on where it was when it is given again. The same --seed gives the same bytes,
-with any number of --workers.
+whoever does the work.
 """
 
 Told = Callable[[int], None]
@@ -44,7 +44,7 @@ def _heads(args: argparse.Namespace) -> None:
     from headvox.synth.heads import make_heads
 
     with _Progress("head", args.count) as progress:
-        make_heads(args.out, args.count, args.points, args.metric, args.seed, args.workers, progress)
+        make_heads(args.out, args.count, args.points, args.metric, args.seed, of_flags(args), progress)
     _tell(args.out, [("heads", str(args.count)), ("points of each", str(args.points))], progress)
 
 
@@ -79,7 +79,7 @@ def _sample(args: argparse.Namespace) -> None:
     from headvox.synth.record import SAMPLE_FRAMES, make_sample
 
     with _Progress("frame", SAMPLE_FRAMES) as progress:
-        make_sample(args.out, workers=args.workers, on_done=progress)
+        make_sample(args.out, workers=of_flags(args), on_done=progress)
     _tell(args.out, [("frames", str(SAMPLE_FRAMES))], progress)
 
 
@@ -101,7 +101,7 @@ def _record(args: argparse.Namespace, stage: Callable[..., Scene]) -> None:
         progress.live.show("people take their places")
         scene = stage(seed=args.seed, duration_s=times[-1] * 1e-9 + 0.1)
         write = write_clouds if is_lidar else write_recording
-        write(args.out, scene, times, args.workers, progress)
+        write(args.out, scene, times, of_flags(args), progress)
     seen_by = ", ".join(camera.name for camera in scene.cameras) or "a LiDAR"
     rows = [("frames", str(args.frames)), ("people", str(len(scene.actors))), ("seen by", seen_by)]
     _tell(args.out, rows, progress)
@@ -218,13 +218,7 @@ def _add_making(parser: argparse.ArgumentParser, seeded: bool = True) -> None:
         parser.add_argument(
             "--seed", type=whole(0), default=0, metavar="N", help="another number, others (0)"
         )
-    parser.add_argument(
-        "--workers",
-        type=whole(1, 256),
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes; the bytes are the same (one for each core)",
-    )
+    add_flags(parser)
 
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:

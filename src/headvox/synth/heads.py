@@ -32,9 +32,9 @@ from headvox.synth.bodies import (
     mean_head_scale,
     mean_height_m,
 )
-from headvox.synth.processes import in_processes
 from headvox.synth.rays import NOTHING, Mesh, look
 from headvox.synth.spread import escapes, spread_points
+from headvox.workers import ALONE, Workers
 
 EYE_DISTANCE_M = 0.064  # of a normalised head
 RANGES = {"age_years": (8.0, 80.0), "sex": (0.0, 1.0), "mass": (0.15, 0.9), "elongation": (-1.0, 1.0)}
@@ -126,21 +126,21 @@ def make_heads(
     points: int = 9000,
     metric: bool = False,
     seed: int = 0,
-    workers: int = 1,
+    workers: Workers = ALONE,
     on_done: Callable[[int], None] | None = None,
 ) -> None:
     """Write ``count`` heads into the folder ``out``.
 
     ``head_00.ply`` is a cloud of ``points`` points, ``head_00_mesh.ply`` its surface; ``manifest.json`` holds
     every head's parameters, centre, eyes and size; ``heads.png`` shows them all. A stopped run goes on where
-    it was, and any number of ``workers`` (processes) writes the same bytes. ``on_done`` is told how many
+    it was, and any ``workers`` write the same bytes. ``on_done`` is told how many
     heads there are so far.
 
     Raises:
         HeadvoxError: a number below one, a negative seed, or a folder that cannot be made or that holds other
             things.
     """
-    for name, value in (("count", count), ("points", points), ("workers", workers)):
+    for name, value in (("count", count), ("points", points)):
         if value < 1:
             raise HeadvoxError(f"Expected {name} to be at least 1, got {value}.", "Give a positive number.")
     if seed < 0:
@@ -157,7 +157,7 @@ def make_heads(
     _claim(out / "settings.json", settings)
     job = partial(_write_head, out=out, points=points, metric=metric, seed=seed)
     entries, pictures = [], []
-    for entry, picture in in_processes(job, identities, workers):
+    for entry, picture in workers.map(job, identities):
         entries.append(entry)
         pictures.append(picture)
         if on_done is not None:

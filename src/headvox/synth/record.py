@@ -27,8 +27,8 @@ from headvox.sources.folder import FRAME_NS
 from headvox.synth.actors import People
 from headvox.synth.camera import d435i
 from headvox.synth.presets import two_cameras
-from headvox.synth.processes import in_processes
 from headvox.synth.scene import Scene, TrueHead
+from headvox.workers import ALONE, Workers
 
 SAMPLE_FRAMES = 24
 SAMPLE_RATE_HZ = 10.0
@@ -48,12 +48,12 @@ def write_recording(
     folder: str | Path,
     scene: Scene,
     stamps_ns: Sequence[int],
-    workers: int = 1,
+    workers: Workers = ALONE,
     on_done: Callable[[int], None] | None = None,
 ) -> Path:
     """Write the frames of a scene at ``stamps_ns`` and ``heads.jsonl``; return the folder.
 
-    The bytes are the same for any number of ``workers`` (processes). ``on_done`` is told how many frames
+    The bytes are the same for any ``workers``. ``on_done`` is told how many frames
     there are so far.
 
     Raises:
@@ -73,7 +73,7 @@ def write_clouds(
     folder: str | Path,
     scene: Scene,
     stamps_ns: Sequence[int],
-    workers: int = 1,
+    workers: Workers = ALONE,
     on_done: Callable[[int], None] | None = None,
 ) -> Path:
     """Write what the one LiDAR of a scene sees as PCD files, and ``heads.jsonl``; return the folder.
@@ -91,7 +91,7 @@ def _write(
     folder: Path,
     scene: Scene,
     stamps_ns: Sequence[int],
-    workers: int,
+    workers: Workers,
     on_done: Callable[[int], None] | None,
     write_frame: Callable[[Path, Frame, int], None],
     description: str | None,
@@ -100,8 +100,6 @@ def _write(
         raise HeadvoxError(f"{folder} exists already.", "Give another name, or remove it first.")
     if not stamps_ns or any(b <= a for a, b in pairwise(stamps_ns)):
         raise HeadvoxError("Expected at least one stamp, each later than the one before.", "Sort the stamps.")
-    if workers < 1:
-        raise HeadvoxError(f"Expected at least 1 worker, got {workers}.", "Give a whole number from 1 on.")
     partial_folder = folder.with_name(folder.name + ".partial")
     _begin(partial_folder, _making(scene, stamps_ns))
     truth = partial_folder / "truth"
@@ -109,7 +107,7 @@ def _write(
         place.mkdir(exist_ok=True)
     job = partial(_make_frame, folder=partial_folder, scene=scene, write_frame=write_frame)
     lines = []
-    for line in in_processes(job, list(enumerate(stamps_ns)), workers):
+    for line in workers.map(job, list(enumerate(stamps_ns))):
         lines.append(line)
         if on_done is not None:
             on_done(len(lines))
@@ -249,7 +247,7 @@ def sample_scene_of_three(seed: int = 0, people: People | None = None) -> Scene:
 def make_sample(
     out: str | Path,
     people: People | None = None,
-    workers: int = 1,
+    workers: Workers = ALONE,
     on_done: Callable[[int], None] | None = None,
 ) -> Path:
     """Write the small two-camera recording that comes with the package: 24 frames, under 3.5 MB."""

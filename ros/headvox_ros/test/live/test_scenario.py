@@ -7,6 +7,7 @@ import pytest
 from headvox.synth.camera import d435i
 from headvox.synth.presets import two_cameras
 from headvox.synth.record import stamps, write_recording
+from headvox.workers import Workers
 from headvox_ros.scenario import play, report
 
 FRAMES, LOOPS = 12, 2
@@ -15,7 +16,9 @@ FRAMES, LOOPS = 12, 2
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
     scene = two_cameras(3, duration_s=0.1 * FRAMES, sensor=d435i())
-    return str(write_recording(tmp_path_factory.mktemp("rig") / "rig", scene, stamps(FRAMES), workers=2))
+    return str(
+        write_recording(tmp_path_factory.mktemp("rig") / "rig", scene, stamps(FRAMES), workers=Workers(2))
+    )
 
 
 @pytest.mark.parametrize("sensors", ["depth", "cloud"])

@@ -190,3 +190,29 @@ def test_a_full_disk_is_told():
 def test_a_field_that_is_none_is_a_mistake(tmp_path):
     with closing(McapFile(tmp_path / "a.mcap")) as file, pytest.raises(KeyError):
         file.write("/p", "geometry_msgs/msg/PoseArray", 0, {"posse": []})
+
+
+def test_what_a_killed_run_has_written_can_be_recovered(tmp_path):
+    sink = open_sink(tmp_path / "heads.mcap")
+    for k in range(600):
+        sink.write(Result(k, STAMP + k, 1.0, heads_at((1.0, 2.0, 1.7))))
+    copy = tmp_path / "killed.mcap"
+    copy.write_bytes((tmp_path / "heads.mcap").read_bytes())  # as it is on the disk now
+    sink.close()
+    with copy.open("rb") as file:
+        chunks = [record for record in _records(file) if type(record).__name__ == "Chunk"]
+    kept = sum(chunk.uncompressed_size for chunk in chunks)
+    with (tmp_path / "heads.mcap").open("rb") as file:
+        whole = sum(r.uncompressed_size for r in _records(file) if type(r).__name__ == "Chunk")
+    assert len(chunks) >= 2
+    assert whole - kept <= (256 << 10) + 10_000
+
+
+def _records(file):
+    from mcap.exceptions import EndOfFile
+    from mcap.stream_reader import StreamReader
+
+    try:
+        yield from StreamReader(file, emit_chunks=True).records
+    except EndOfFile:
+        return

@@ -13,6 +13,7 @@ import pytest
 from headvox.data import Frame, Intrinsics
 from headvox.errors import HeadvoxError, Undecided
 from headvox.sources import open_source, realsense
+from headvox.sources.describe import describe
 from headvox.sources.extrinsics import read_extrinsics
 from headvox.sources.options import SourceOptions, mount, mounted
 
@@ -92,6 +93,13 @@ def test_a_recording_of_the_sdk_is_played_whole_by_the_real_pipeline(recorded):
         assert image.intrinsics == Intrinsics(WIDTH, HEIGHT, 60.0, 61.0, 31.5, 23.5, 0.001)
     assert "the camera is taken to stand 1.2 m above the floor" in notes[0]
     np.testing.assert_allclose(frames[0].depths[0].T_world_camera, mounted(mount(0, 0, 1.2, 0, 0, 0), True))
+
+
+def test_info_tells_what_is_in_a_recording(recorded):
+    rows = dict(describe(recorded, SourceOptions(T_world_mount=T)))
+    assert (rows["kind"], rows["camera"]) == ("RealSense recording", "123, 64x48")
+    assert rows["looked at"] == "the first 10 frames, 0 of them cannot be read"
+    assert rows["camera depth"] == "1.50 m above the floor at x 1.00 y 2.00 m, tilted 20.0° down"
 
 
 def test_where_it_stood_can_be_said(recorded):
@@ -244,3 +252,19 @@ def test_extrinsics_that_cannot_be_used_are_refused(tmp_path, text, message):
 def test_extrinsics_that_are_not_there_are_refused(tmp_path):
     with pytest.raises(HeadvoxError, match="No such file"):
         read_extrinsics(str(tmp_path / "rig"))
+
+
+def test_a_bag_of_the_sdk_goes_to_the_sdk(tmp_path):
+    """Those of its older versions are bags of ROS 1; this one is too small for it."""
+    rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="rosbags is not installed")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with rosbag1.Writer(tmp_path / "sdk.bag") as writer:
+        for topic in ("/file_version", "/device_0/sensor_0/info"):
+            number = writer.add_connection(topic, "std_msgs/msg/UInt32", typestore=store)
+            content = store.types["std_msgs/msg/UInt32"](2)
+            writer.write(number, 1, store.serialize_ros1(content, "std_msgs/msg/UInt32"))
+    with pytest.raises(HeadvoxError, match=r"sdk\.bag: .* Has it a depth stream") as refused:
+        open_source(tmp_path / "sdk.bag")
+    assert "\n" not in str(refused.value)

@@ -13,11 +13,12 @@ import numpy as np
 from headvox.data import F64, BadFrame, Frame
 from headvox.errors import HeadvoxError
 from headvox.frames import transform, unproject
-from headvox.sources import open_source
+from headvox.sources import Source, open_source
 from headvox.sources.bag import BagSource
 from headvox.sources.cloudfile import CloudFile, CloudFileSource, read_cloud_file
 from headvox.sources.folder import FRAME_NS, FolderSource
 from headvox.sources.options import SourceOptions, listed
+from headvox.sources.realsense import RealSenseFile
 from headvox.sources.recording import Camera, RecordedFrame, RecordingSource
 
 Rows = list[tuple[str, str]]
@@ -49,6 +50,8 @@ def describe(
             rows = [("frames", "1"), *_file_rows(read_cloud_file(source.path))]
         case BagSource():
             rows = _bag_rows(source)
+        case RealSenseFile():
+            rows = [("kind", "RealSense recording"), ("camera", source.words), *_seen_rows(source)]
         case _:
             rows = [("frames", "not known" if source.length is None else str(source.length))]
     source.close()
@@ -95,14 +98,19 @@ def _bag_rows(source: BagSource) -> Rows:
         f"{topic.name} ({topic.count})" for topic in source.bag.topics.values() if topic.name not in read
     ]
     rows.append(("other topics", listed(others)))
+    return rows + _seen_rows(source)
+
+
+def _seen_rows(source: Source) -> Rows:
     frames = list(islice(source, _LOOKED_AT))
     good = [frame for frame in frames if isinstance(frame, Frame)]
-    rows.append(
-        ("looked at", f"the first {len(frames)} frames, {len(frames) - len(good)} of them cannot be read")
-    )
+    unread = len(frames) - len(good)
     placed = [(image.name, image.T_world_camera) for frame in good[:1] for image in frame.depths]
-    rows += [(f"camera {name}", f"{_where(T)}, {_tilt(T)}") for name, T in placed]
-    return [*rows, ("box", _box(_corners(good)))]
+    return [
+        ("looked at", f"the first {len(frames)} frames, {unread} of them cannot be read"),
+        *((f"camera {name}", f"{_where(T)}, {_tilt(T)}") for name, T in placed),
+        ("box", _box(_corners(good))),
+    ]
 
 
 def _corners(frames: Iterable[Frame]) -> F64:

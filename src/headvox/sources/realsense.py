@@ -62,6 +62,7 @@ class RealSenseFile:
             profile = started.get_stream(rs.stream.depth).as_video_stream_profile()
             scale = _depth_scale(rs, device.query_sensors())
             self._camera = _intrinsics(profile, scale)
+            self.words = f"{serial}, {self._camera.width}x{self._camera.height}"
             self._T_world_camera = _places(self.name, [serial], options, say)[serial]
         except RuntimeError as error:
             self.close()

@@ -82,6 +82,25 @@ def test_gathering_equals_the_naive_twin(seed):
         np.testing.assert_allclose(got, wanted, atol=1e-12)
 
 
+@pytest.mark.parametrize("distance", [0.1, 3.0, 60.0])
+@pytest.mark.parametrize("knows", [True, False])
+def test_gathering_misses_nothing_however_far_the_sensor(distance, knows):
+    rng = np.random.default_rng(int(distance))
+    T = scenes.pose(rng)
+    centre = T[:3, 3] + distance * T[:3, 0]
+    cloud = np.vstack([rng.normal(0, 0.2, (500, 3)), rng.normal(0, 0.5, (500, 3))])
+    cloud[:500] += [distance, 0, 0]
+    cloud[500:1000] += [distance + 2.0, 0, 0]
+    if not knows:
+        cloud, T = cloud @ T[:3, :3].T + T[:3, 3], None
+    frame = Frame(
+        0, clouds=(Cloud("cloud", np.ascontiguousarray(rng.permutation(cloud), dtype=np.float32), T),)
+    )
+    for got, wanted in zip(gathered(frame, centre), naive_pose.gather(frame, centre), strict=True):
+        assert len(wanted) > 100 or not knows
+        np.testing.assert_allclose(got, wanted, atol=1e-12)
+
+
 def random_state(rng):
     state = np.zeros(align.STATE)
     state[:3] = rng.normal(0, 0.02, 3)

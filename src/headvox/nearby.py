@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from headvox.data import F64, Frame
 from headvox.kernels import bare_kernel, read_only, rule
+from headvox.simd import LANES, add, below, fill, load_triples, lowest, mul, sub
 
 REACH_M = 0.25
 MOST_SAMPLES = 8192  # of one candidate, shared by all sensors
@@ -25,6 +26,7 @@ PIXEL_SIGMA = 0.7  # a contour wanders by so many pixels
 DEPTH_SIGMA_M = 0.0015  # at the sensor, and
 DEPTH_SIGMA_PER_M = 0.0036  # times the distance squared: a D435i
 CLOUD_FOCAL_PX = 450.0  # of the camera that a cloud is taken to come from
+TINY = 1e-12  # m⁴: a point at the sensor is looked at, whatever its direction
 UNKNOWN_SIGMA_M = 0.002  # of points whose sensor nobody knows
 
 
@@ -113,6 +115,38 @@ def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  #
     return n, m
 
 
+@rule
+def _ball(T, reach):  # type: ignore[no-untyped-def]
+    """Return, for :func:`_may_be_near`, the origin's place in the sensor's frame, and two bounds (m²).
+
+    They are wide enough for what rounding to float32 and a transform that is not quite rigid may change.
+    """
+    x = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
+    y = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
+    z = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
+    squared = x * x + y * y + z * z
+    wide = reach + 0.02 + 0.005 * np.sqrt(squared)
+    wide2 = wide * wide
+    return np.float32(x), np.float32(y), np.float32(z), np.float32(wide2), np.float32(squared - wide2)
+
+
+@rule
+def _may_be_near(flat, at, ball, knows):  # type: ignore[no-untyped-def]
+    """Return a bit for each of the LANES points from ``flat[at]`` on: 0 for what is neither near nor passes near.
+
+    Without a sensor that is what lies outside of a ball, and with one whose ray misses it: d² < r², where the square of
+    the distance d of the ball's centre c from the ray through p is c² - (c·p)² / p².
+    """
+    cx, cy, cz, wide2, rest = ball
+    px, py, pz = load_triples(flat, at)
+    if knows:
+        along = add(add(mul(px, fill(cx)), mul(py, fill(cy))), mul(pz, fill(cz)))
+        squared = add(add(mul(px, px), mul(py, py)), mul(pz, pz))
+        return below(sub(mul(squared, fill(rest)), fill(np.float32(TINY))), mul(along, along))
+    dx, dy, dz = sub(px, fill(cx)), sub(py, fill(cy)), sub(pz, fill(cz))
+    return below(add(add(mul(dx, dx), mul(dy, dy)), mul(dz, dz)), fill(wide2))
+
+
 @bare_kernel
 def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
     """Add what a cloud shows; ``T`` (3, 4) maps its frame, ``knows`` says whether the sensor is at its origin.
@@ -123,40 +157,51 @@ def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):
     reach2, distance2 = reach * reach, ox * ox + oy * oy + oz * oz
     first_n, first_m = n, m
     hits, passes, every_hit, every_pass = 0, 0, 1, 1
-    for i in range(0, points.shape[0], max(1, (points.shape[0] + MOST_VISITS - 1) // MOST_VISITS)):
-        px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz
-        squared = x * x + y * y + z * z
-        wx, wy, wz = x + ox, y + oy, z + oz
-        if wx * wx + wy * wy + wz * wz < reach2:
-            hits += 1
-            if hits % every_hit == 0:
-                if n == most_n:
-                    n = _thin(samples, first_n, n)
-                    every_hit *= 2
-                samples[n, 0], samples[n, 1], samples[n, 2] = wx, wy, wz
-                samples[n, 3], samples[n, 4], samples[n, 5] = 0.0, 0.0, 0.0
-                samples[n, 6], samples[n, 7] = 0.0, UNKNOWN_SIGMA_M
-                if knows:
-                    length = max(np.sqrt(squared), 1e-6)
-                    samples[n, 3], samples[n, 4], samples[n, 5] = x / length, y / length, z / length
-                    samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * squared
-                    samples[n, 7] = PIXEL_SIGMA * length / CLOUD_FOCAL_PX
-                n += 1
-            continue
-        along = -(x * ox + y * oy + z * oz)  # times the ray's length: where it is nearest to the origin
-        if knows and 0.0 < along < squared and distance2 - along * along / squared < reach2:
-            passes += 1
-            if passes % every_pass == 0:
-                if m == most_m:
-                    m = _thin(rays, first_m, m)
-                    every_pass *= 2
-                length = np.sqrt(squared)
-                rays[m, 3], rays[m, 4], rays[m, 5] = x / length, y / length, z / length
-                _place(T, along / length, rays, m)
-                m += 1
+    step = max(1, (points.shape[0] + MOST_VISITS - 1) // MOST_VISITS)
+    flat = points.reshape(-1)
+    ball = _ball(T, reach)
+    for first in range(0, points.shape[0], LANES):
+        bits = np.uint32(0xFFFFFFFF)
+        if first + LANES <= points.shape[0]:
+            bits = _may_be_near(flat, 3 * first, ball, knows)
+        while bits:
+            i = first + lowest(bits)
+            bits &= bits - np.uint32(1)
+            if i % step or i >= points.shape[0]:
+                continue
+            px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz
+            squared = x * x + y * y + z * z
+            wx, wy, wz = x + ox, y + oy, z + oz
+            if wx * wx + wy * wy + wz * wz < reach2:
+                hits += 1
+                if hits % every_hit == 0:
+                    if n == most_n:
+                        n = _thin(samples, first_n, n)
+                        every_hit *= 2
+                    samples[n, 0], samples[n, 1], samples[n, 2] = wx, wy, wz
+                    samples[n, 3], samples[n, 4], samples[n, 5] = 0.0, 0.0, 0.0
+                    samples[n, 6], samples[n, 7] = 0.0, UNKNOWN_SIGMA_M
+                    if knows:
+                        length = max(np.sqrt(squared), 1e-6)
+                        samples[n, 3], samples[n, 4], samples[n, 5] = x / length, y / length, z / length
+                        samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * squared
+                        samples[n, 7] = PIXEL_SIGMA * length / CLOUD_FOCAL_PX
+                    n += 1
+                continue
+            along = -(x * ox + y * oy + z * oz)  # times the ray's length: where it is nearest to the origin
+            if knows and 0.0 < along < squared and distance2 - along * along / squared < reach2:
+                passes += 1
+                if passes % every_pass == 0:
+                    if m == most_m:
+                        m = _thin(rays, first_m, m)
+                        every_pass *= 2
+                    length = np.sqrt(squared)
+                    rays[m, 3], rays[m, 4], rays[m, 5] = x / length, y / length, z / length
+                    _place(T, along / length, rays, m)
+                    m += 1
     return n, m
 
 

@@ -344,6 +344,28 @@ def test_a_small_bag_cannot_fill_the_memory(tmp_path, monkeypatch):
         opened(place)
 
 
+@pytest.mark.parametrize("at_once", [1, 7, 1000, 1 << 20])
+def test_what_is_unpacked_in_pieces_is_whole(monkeypatch, at_once):
+    import bz2
+
+    import lz4.frame
+    from rosbags.rosbag2 import writer
+
+    monkeypatch.setattr(bagfile, "_AT_ONCE", at_once)
+    data = np.random.default_rng(0).integers(0, 9, 3000, dtype=np.uint8).tobytes()
+    for pack, unpacker in (
+        (bz2.compress, bz2.BZ2Decompressor),
+        (lz4.frame.compress, lz4.frame.LZ4FrameDecompressor),
+        (writer.zstd.compress, writer.zstd.ZstdDecompressor),
+    ):
+        assert bagfile.bounded(unpacker(), pack(data)) == data
+        assert bagfile.bounded(unpacker(), pack(data), 3000) == data
+        with pytest.raises(ValueError, match="more than 2999"):
+            bagfile.bounded(unpacker(), pack(data), 2999)
+        with pytest.raises(ValueError, match="cut off"):
+            bagfile.bounded(unpacker(), pack(data)[:-20])
+
+
 def test_an_mcap_that_was_not_closed_says_so(tmp_path):
     place = write_bag(tmp_path, "bare-mcap", rig(Maker()))
     place.write_bytes(place.read_bytes()[:-2000])

@@ -26,6 +26,7 @@ MOST_UNPACKED_BYTES = 1 << 30  # of one message or chunk: a hundred times the la
 MOST_METADATA_BYTES = 16 << 20
 _MOST_EXPANSION = 1000  # of a bag that is compressed as a whole
 _PIECE = 1 << 20
+_AT_ONCE = 64 << 20
 _FIRST_FEW = 10
 _ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
@@ -218,12 +219,17 @@ def _bound(of_ros1: dict[str, Any], of_mcap: dict[str, Any], folder_reader: Any)
 def bounded(decompressor: Any, data: bytes, size: int | None = None) -> bytes:
     """Return what ``data`` unpacks to, or raise ValueError when that is more than ``size`` or the limit."""
     most = MOST_UNPACKED_BYTES if size is None else min(size, MOST_UNPACKED_BYTES)
-    unpacked: bytes = decompressor.decompress(data, max_length=most + 1)
-    if len(unpacked) > most:
+    # Some decompressors set aside as much as they are allowed to return: not the whole limit at once.
+    pieces = [decompressor.decompress(data, max_length=min(most + 1, _AT_ONCE))]
+    total = len(pieces[0])
+    while pieces[-1] and total <= most and not decompressor.eof:
+        pieces.append(decompressor.decompress(b"", max_length=min(most + 1 - total, _AT_ONCE)))
+        total += len(pieces[-1])
+    if total > most:
         raise ValueError(f"it unpacks to more than {most} bytes")
     if not decompressor.eof:
         raise ValueError("the compressed data is cut off")
-    return unpacked
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
 class _BoundedFile:

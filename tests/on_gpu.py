@@ -29,7 +29,7 @@ from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes
 from headvox.voxelize import Lattice, Rays, voxelize_depth, voxelize_points
 
 # The simulator computes as NumPy's scalars do, which tell of what the hardware does silently.
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore:Grid size")
 sys.setswitchinterval(2e-5)  # the simulator's threads wait for each other busily
 
 STAGES = parse_cascade(scenes.STAGES, "test")

@@ -8,7 +8,6 @@ need no volume of their own.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy.typing as npt
 
 from headvox.data import F32, F64, DepthImage, Intrinsics
 from headvox.frames import inverse
-from headvox.kernels import kernel, product, read_only, rule
+from headvox.kernels import bare_kernel, kernel, product, read_only, rule
 from headvox.voxelize import Lattice
 
 HIDDEN, EMPTY = 1, 2
@@ -39,6 +38,12 @@ def project(camera, row, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @rule
+def floored(value):  # type: ignore[no-untyped-def]
+    """Return the whole number at or below ``value``."""
+    return int(np.floor(value))  # math.floor goes by way of float64
+
+
+@rule
 def pixel_of(camera, x, y, z):  # type: ignore[no-untyped-def]
     """Return column and row that see the centre of the cell x, y, z, and how far away it is (m): -1 if too near.
 
@@ -49,8 +54,8 @@ def pixel_of(camera, x, y, z):  # type: ignore[no-untyped-def]
     if not far > np.float32(NEAREST_M):
         return -1, -1, far
     half = np.float32(0.5)
-    column = np.int64(math.floor(project(camera, 0, x, y, z) / far + half))
-    row = np.int64(math.floor(project(camera, 1, x, y, z) / far + half))
+    column = floored(project(camera, 0, x, y, z) / far + half)
+    row = floored(project(camera, 1, x, y, z) / far + half)
     return column, row, far
 
 
@@ -77,7 +82,7 @@ def look(depth, camera, x, y, z):  # type: ignore[no-untyped-def]
     return state_at(depth[row, column], camera, far)
 
 
-@kernel
+@bare_kernel
 def look_about(depth, camera, cells, offsets, states):  # type: ignore[no-untyped-def]
     """Merge what one camera saw of the cells about each candidate into ``states`` (candidates, offsets)."""
     for i in range(cells.shape[0]):

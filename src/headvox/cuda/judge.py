@@ -6,7 +6,7 @@ import numpy as np
 from numba import cuda
 
 from headvox.cuda.gate import cell_of
-from headvox.cuda.lanes import device, kernel, on_device, product_32
+from headvox.cuda.lanes import device, floored, kernel, on_device, product_32
 from headvox.cuda.readings import (
     DATA,
     DEPTH,
@@ -24,7 +24,7 @@ from headvox.cuda.suppress import CANDIDATES, JUDGED, KEPT, PEAKS
 from headvox.visibility import EMPTY, HIDDEN, pixel_of, project, state_at
 from headvox.vote import DROPPED
 
-_pixel_of = on_device(pixel_of, project=on_device(project, product=product_32))
+_pixel_of = on_device(pixel_of, project=on_device(project, product=product_32), floored=floored)
 _state_at = on_device(state_at, product=product_32)
 
 # The report of a frame: a few numbers, then a row for each peak that was judged.

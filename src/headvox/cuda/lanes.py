@@ -7,6 +7,8 @@ functions, one thread after the other.
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any
@@ -21,6 +23,9 @@ from headvox.vote import sum_about
 SIMULATED = bool(getattr(config, "ENABLE_CUDASIM", 0))
 
 Loop = Callable[..., Any]
+
+# Numba warns of every launch of few blocks, but some stages look at a few peaks only.
+warnings.filterwarnings("ignore", r"Grid size \d+ will likely result in GPU under-utilization")
 
 
 def kernel(function: Loop) -> Any:
@@ -105,6 +110,12 @@ def less(a, b):  # type: ignore[no-untyped-def]
 def within(a, low, high):  # type: ignore[no-untyped-def]
     """Return 1 if low <= a <= high, else 0."""
     return 1 if np.int64(low) <= a <= np.int64(high) else 0
+
+
+@device
+def floored(value):  # type: ignore[no-untyped-def]
+    """Return the whole number at or below ``value``: NumPy's floor is not there on the device."""
+    return np.int64(math.floor(value))
 
 
 @device

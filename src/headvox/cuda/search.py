@@ -55,6 +55,7 @@ class Search:
         self._room_for_words(1)
         cells = math.prod(shape)
         self.cells = self._empty(cells if self.counting else -(-cells // 4), np.uint32)
+        self._grid = self.cells.view(self._cell_type)
         self.S = cuda.device_array((frames, nx + 1, ny + 1, nz + 1), np.uint32)
         self.places = (nx + 2) * (ny + 2) * (nz + 2)
         self.passed = self._empty(-(-self.places // 32), np.uint32)
@@ -66,6 +67,7 @@ class Search:
         side = 2 * patch_reach + 1
         patch_bytes = most_peaks * side**3 * self._cell_type.itemsize
         self.report = self._empty(8 * each + -(-patch_bytes // 8) * 8, np.uint8)
+        self._report_rows, self._report_cells = self.report.view(np.int64), self.report.view(self._cell_type)
         self.host_report = cuda.pinned_array(self.report.shape, np.uint8)
         self._first_patch = 8 * each // self._cell_type.itemsize
 
@@ -268,11 +270,11 @@ class Search:
     def _report(self, frames: int) -> None:
         judge.report[(1, frames), 1, self.stream](
             self.S, self.whole, self.counts, self.judged, self.judged_places, self.judged_scores, self.yaws, self.kept,
-            self.report.view(np.int64),
+            self._report_rows,
         )  # fmt: skip
         judge.copy_patches[self.on(self.most_peaks * THREADS, frames)](
-            self.S, self.counts, self.cells.view(self._cell_type), self.kept, self.reach,
-            self.report.view(self._cell_type), self._first_patch,
+            self.S, self.counts, self._grid, self.kept, self.reach,
+            self._report_cells, self._first_patch,
         )  # fmt: skip
 
     def _read(self, report: npt.NDArray[np.uint8]) -> Found:

@@ -185,9 +185,11 @@ class Detector:
 
     def _asked(self, frame: Frame, expected: Expected | None) -> Asked:
         """Return what the device is to do with ``frame``."""
-        lattice = self._memory_for(frame).lattice
-        kept = self._threshold(frame) - (self._slack() if expected is not None and len(expected) else 0)
-        return Asked(frame, lattice, self._sees(frame), kept)
+        memory = self._memory_for(frame)
+        kept = self._threshold(frame, memory) - (
+            self._slack() if expected is not None and len(expected) else 0
+        )
+        return Asked(frame, memory.lattice, self._sees(frame, memory), kept)
 
     def _device_of(self, lattice: Lattice) -> Device:
         if (
@@ -213,7 +215,7 @@ class Detector:
         memory.enter_patches(found)
         memory.make_room(len(found.cells))
         memory.yaws[: len(found.cells)] = found.yaws
-        threshold = self._threshold(asked.frame)
+        threshold = self._threshold(asked.frame, memory)
         kept = self._kept(found.cells, found.scores, threshold, memory, expected)
         peaks = np.flatnonzero(kept)
         return self._refine(
@@ -360,21 +362,21 @@ class Detector:
         if judge is not None and len(cells):
             cells, scores, found = self._best_about(S, cells, judge, memory)
             peaks = peaks[found]
-            if self._sees(frame) and len(cells):
+            if self._sees(frame, memory) and len(cells):
                 scores = self._look_about(frame, S, cells, judge, memory)
-        threshold = self._threshold(frame)
+        threshold = self._threshold(frame, memory)
         kept = self._kept(cells, scores, threshold, memory, expected)
         return cells[kept], scores[kept], peaks[kept], threshold
 
-    def _sees(self, frame: Frame) -> bool:
+    def _sees(self, frame: Frame, memory: _Memory) -> bool:
         """Whether the judge can ask the cameras what they saw: not with clouds, of which nobody knows what is free."""
-        return self.cascade.source.sees and len(frame.depths) > 0 and not frame.clouds
+        return memory.sees and len(frame.depths) > 0 and not frame.clouds
 
-    def _threshold(self, frame: Frame) -> int:
+    def _threshold(self, frame: Frame, memory: _Memory) -> int:
         """Return the least score of a head, in steps."""
         cascade, least = self.cascade.source, self.config.min_score
         if least is None:
-            blind = cascade.sees and not self._sees(frame)
+            blind = memory.sees and not self._sees(frame, memory)
             least = cascade.min_score_occupied if blind else cascade.min_score
         return math.ceil(least * SCORE_UNIT)
 
@@ -564,6 +566,7 @@ class _Memory:
         self.survivors = np.empty((4096, 3), np.int32)
         self.points = np.empty((MOST_PARTS, 3))
         self.unseen = np.zeros((1, 1, 2), np.int32)
+        self.sees = cascade.source.sees  # asks every tree: not for every frame
         self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
         self.judge = _Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
         self.scratch = [Scratch.new() for _ in range(threads if detector.config.refine == "pose" else 0)]

@@ -133,10 +133,8 @@ def align_one(samples, rays, turn, upright, template):
     state = np.zeros(align.STATE)
     state[3:12] = turn
     most = (align.FINE_SAMPLES, align.FINE_RAYS)
-    samples, rays = samples[even(len(samples), most[0])], rays[even(len(rays), most[1])]
-    for step, k in enumerate(np.linspace(align.FINE_K, align.LAST_K, align.FINE_STEPS)):
-        every = 2 if step < align.HALF_STEPS else 1
-        _, A, b, _ = linearise(samples[::every], rays[::every], most, modes, k, upright, template, state)
+    for k in np.linspace(align.FINE_K, align.LAST_K, align.FINE_STEPS):
+        _, A, b, _ = linearise(samples, rays, most, modes, k, upright, template, state)
         state = move(state, -np.linalg.solve(A, b))
     cost, A, _, told = linearise(samples, rays, most, modes, align.LAST_K, upright, template, state)
     return state, [*told, cost + 0.5 * np.linalg.slogdet(A)[1]], np.linalg.inv(A)[:6, :6]

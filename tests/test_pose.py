@@ -15,6 +15,7 @@ from headvox.synth.spread import spread_points
 from headvox.template import load_template
 
 TEMPLATE = load_template()
+SURE_DEG = 15.0  # a yaw that is stated to this counts as known, see bench/refine.py
 
 
 def camera(distance=1.0, width=48, focal=45.0):
@@ -227,8 +228,8 @@ def test_the_back_of_a_head_knows_its_centre_and_not_its_yaw(views):
     view, start = views[0]
     face = fitted(view.frame, start).rotation_covariances[0, 2, 2]
     assert np.isnan(sigmas).any()  # some do not say at all where the face is, and
-    assert np.nanmin(sigmas) > 25.0  # the others that they hardly know
-    assert np.degrees(np.sqrt(face)) < 15.0  # as a face at 1 m does
+    assert np.nanmin(sigmas) > SURE_DEG  # none that it knows
+    assert np.degrees(np.sqrt(face)) < SURE_DEG  # as a face at 1 m does
 
 
 def test_a_shell_is_found_however_it_is_turned():

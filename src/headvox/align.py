@@ -31,8 +31,7 @@ COST, ON_SURFACE, CROSSED, EVIDENCE = 0, 1, 2, 3  # what is told of a fit
 TOLD = 4
 
 COARSE_STEPS, FINE_STEPS = 4, 5
-COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 100, 200, 160  # the coarse ones are half of the fine ones
-HALF_STEPS = 3  # of the fine steps look at half of the points and rays
+COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 120, 200, 160
 COARSE_MODES = 3
 COARSE_K, FINE_K, LAST_K = (
     6.0,
@@ -97,15 +96,10 @@ class Scratch(NamedTuple):
 
 @rule
 def choose(source, there, target, most):  # type: ignore[no-untyped-def]
-    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many.
-
-    Every second one comes first: the first half of them is spread as evenly as all are.
-    """
+    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many."""
     used = min(there, most)
-    half = (used + 1) // 2
     for s in range(used):
-        rank = 2 * s if s < half else 2 * (s - half) + 1
-        at = (2 * rank + 1) * there // (2 * used)
+        at = (2 * s + 1) * there // (2 * used)
         for j in range(source.shape[1]):
             target[s, j] = source[at, j]
     return used
@@ -336,12 +330,11 @@ def _move(state, x, size):  # type: ignore[no-untyped-def]
 
 @bare_kernel
 def explore(work, used, starts, upright, template):  # type: ignore[no-untyped-def]
-    """Take a few steps from each of ``starts`` (S, 9), on some of the ``used`` points and no rays.
+    """Take a few steps from each of ``starts`` (S, 9), on the ``used`` points and no rays.
 
     States and costs are left in ``work``.
     """
     A, x, modes, rays = work.A, work.x, np.int64(COARSE_MODES), np.int64(0)
-    used = min(used, COARSE_SAMPLES)
     for i in range(starts.shape[0]):
         state = work.coarse[i]
         for step in range(COARSE_STEPS + 1):
@@ -359,19 +352,15 @@ def explore(work, used, starts, upright, template):  # type: ignore[no-untyped-d
 def refine(work, used, rays, upright, template, at):  # type: ignore[no-untyped-def]
     """Take the steps of all modes from the state ``at`` of ``work.fine``.
 
-    The first of them look at every second of the ``used`` points and ``rays`` only. What the last state costs, and its
-    covariance, are left in ``work``.
+    All ``used`` points and ``rays`` count. What the last state costs, and its covariance, are left in ``work``.
     """
     A, x, state, told = work.A, work.x, work.fine[at], work.told[at]
     modes, always = np.int64(MODES), np.bool_(True)  # constants would make Numba compile linearise for each
     for step in range(FINE_STEPS + 1):
         k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
-        n, m = (used + 1) // 2, (rays + 1) // 2
-        if step >= HALF_STEPS:
-            n, m = used, rays
         cost = linearise(
-            work.points, n, work.passing, m, modes, k, upright, always, template.rows, template.low, template.voxel_m,
-            state, work.J, A, told,
+            work.points, used, work.passing, rays, modes, k, upright, always, template.rows, template.low,
+            template.voxel_m, state, work.J, A, told,
         )  # fmt: skip
         told[EVIDENCE] = cost + solve(A, x, 7 + modes)
         if step < FINE_STEPS:
@@ -387,16 +376,14 @@ def align(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def
     refined; ``work`` has their states, what they cost and their covariances. A single start is refined at once.
     """
     coarse, fine, costs, count = work.coarse, work.fine, work.costs, starts.shape[0]
-    used, rays = (
-        choose(work.samples, n, work.points, FINE_SAMPLES),
-        choose(work.rays, m, work.passing, FINE_RAYS),
-    )
     for i in range(count):
         costs[i] = 0.0
         for j in range(STATE):
             coarse[i, j] = starts[i, j - 3] if 3 <= j < 12 else 0.0
     if count > 1:
-        explore(work, used, starts, upright, template)
+        explore(work, choose(work.samples, n, work.points, COARSE_SAMPLES), starts, upright, template)
+    used = choose(work.samples, n, work.points, FINE_SAMPLES)
+    rays = choose(work.rays, m, work.passing, FINE_RAYS)
     least = np.inf
     for i in range(count):
         least = min(least, costs[i])

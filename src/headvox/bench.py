@@ -377,12 +377,7 @@ def _ratio(ms: list[float], yardstick: list[float] | None) -> float | None:
 # ------------------------------------------------------------------------------------------------- the command
 
 
-def main(argv: list[str]) -> int:
-    """Run ``headvox bench`` with the flags ``argv``; return the exit code.
-
-    Raises:
-        HeadvoxError: no such cascade.
-    """
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "headvox bench",
         description="Measure how fast headvox is on this machine. It makes its own input.",
@@ -404,8 +399,17 @@ def main(argv: list[str]) -> int:
         "--quick", action="store_true", help="a few rounds on small images: only to see it work"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+    return parser
+
+
+def main(argv: list[str]) -> int:
+    """Run ``headvox bench`` with the flags ``argv``; return the exit code.
+
+    Raises:
+        HeadvoxError: no such cascade.
+    """
     try:
-        args = parser.parse_args(argv)
+        args = _parser().parse_args(argv)
     except SystemExit as done:  # after --help or wrong usage
         return int(done.code or 0)
     rounds = args.rounds or (5 if args.quick else 100)

@@ -16,7 +16,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from headvox import __version__, masks_command
+from headvox import __version__, completion, doctor, masks_command
 from headvox.errors import HeadvoxError, Undecided
 from headvox.flags import (
     GOOD,
@@ -38,6 +38,7 @@ from headvox.flags import (
 from headvox.render import command as render_command
 from headvox.sinks import SUFFIXES
 from headvox.table import printable, table
+from headvox.view import command as view_command
 from headvox.workers import add_flags, of_flags
 
 if TYPE_CHECKING:
@@ -170,16 +171,32 @@ def _run(args: argparse.Namespace) -> int:
             sinks.append(stack.enter_context(closing(open_sink(args.output, frame))))
         if args.json:
             sinks.append(JsonStream(sys.stdout))
-        report = session.run(sinks)
+        watch = None
+        if args.view is not None:
+            from headvox.view.watch import Watch
+
+            if args.view:
+                keep_input(args.view, session.inputs)
+            watch = stack.enter_context(closing(Watch(session.detector, args.view or None)))
+        report = session.run(sinks, on_result=watch.show if watch else None)
+        if watch is not None and watch.dropped:
+            session.live.note(f"headvox: {watch.dropped} frames were not shown: the viewer was busy")
     if not args.json:
         print(summary(report))
     return INTERRUPTED if report.interrupted else GOOD
 
 
 def _run_batch(args: argparse.Namespace) -> int:
-    if args.json or args.output is not None or args.strict or args.limit or args.source is None:
+    if (
+        args.json
+        or args.output is not None
+        or args.view is not None
+        or args.strict
+        or args.limit
+        or args.source is None
+    ):
         raise UsageError(
-            "--into goes with one SOURCE or more, and with none of --json, -o, --strict and --limit"
+            "--into goes with one SOURCE or more, and with none of --json, -o, --view, --strict and --limit"
         )
     from headvox.batch import Settings, run_batch
     from headvox.live import Live
@@ -314,6 +331,14 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="every frame by itself: bare detections, without ids and velocities",
     )
+    run.add_argument(
+        "--view",
+        nargs="?",
+        const=False,
+        type=view_command.rrd_file,
+        metavar="OUT.rrd",
+        help="show the run in rerun's viewer, or write a file for it; never slows the loop",
+    )
     add_settings(run)
     add_tracker_settings(run)
     run.usage = (
@@ -346,8 +371,11 @@ def _parser() -> argparse.ArgumentParser:
     config.usage = "%(prog)s [flags]"
 
     add_command(commands, "warmup", _warmup, "compile every loop now, so that no first run has to wait")
+    view_command.add_to(commands)
     render_command.add_to(commands)
     masks_command.add_to(commands)
+    doctor.add_to(commands)
+    completion.add_to(commands)
     for name, (_, text) in MODULES.items():
         commands.add_parser(name, help=text)
     return parser

@@ -93,6 +93,7 @@ class Detector:
         self._threads = Threads(self.config.threads)
         self._memory: _Memory | None = None
         self._rays: dict[str, tuple[DepthImage, Lattice, Rays]] = {}
+        self._looked_at: tuple[_Memory, I32, I64] | None = None
 
     # ------------------------------------------------------------------------------------------- the public calls
 
@@ -138,6 +139,7 @@ class Detector:
         clock.done("gate")
         scores = self._vote(S, survivors, memory)
         clock.done("vote")
+        self._looked_at = (memory, survivors, scores)
         peaks = self._suppress(S, survivors, scores, memory)
         clock.done("suppress")
         cells, scores, peaks, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
@@ -156,6 +158,22 @@ class Detector:
             return [self.detect_frame(frame) for frame in frames]
         parts = [frames[first : first + BATCH] for first in range(0, len(frames), BATCH)]
         return [heads for part in parts for heads in self._detect_on_device(part, [None] * len(part))]
+
+    def candidates_of_last_frame(self) -> tuple[F64, F64]:
+        """Return what passed the gate of the last frame, and what the second stage gave it; for pictures and tuning.
+
+        These are copies, made by this call, which has to come before the next frame; a detector that is not asked does
+        nothing for it. A GPU keeps them to itself: there are none.
+
+        Returns:
+            The centres of the voxels, (N, 3) metres, world, and their scores (N,), NaN where the second stage dropped
+            one. The scores are those by which the peaks are found: what is said of heads comes from a closer look.
+        """
+        if self._looked_at is None:
+            return np.empty((0, 3)), np.empty(0)
+        memory, survivors, scores = self._looked_at
+        centres = memory.lattice.centres(survivors + memory.first)
+        return centres, np.where(scores > DROPPED, scores / SCORE_UNIT, np.nan)
 
     def close(self) -> None:
         """End the detector's threads."""

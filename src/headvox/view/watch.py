@@ -1,0 +1,88 @@
+"""What a run shows of itself: a letter a frame, for the process that talks to rerun."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from headvox.data import F64, Frame
+from headvox.errors import HeadvoxError
+from headvox.sinks import Result
+from headvox.view.mailbox import Mailbox
+
+if TYPE_CHECKING:
+    from headvox.pipeline import Detector
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What there is to show of a frame."""
+
+    frame: Frame
+    result: Result
+    candidates: F64
+    """(N, 3) metres, world: the voxels that passed the gate."""
+    votes: F64
+    """(N,) what the second stage gave each of them; NaN where it dropped it."""
+    stage_ms: dict[str, float]
+
+
+class Watch:
+    """Shows frames in rerun's viewer, or writes them to an rrd file.
+
+    ``dropped`` counts the frames that were not shown because the viewer was busy.
+    """
+
+    def __init__(self, detector: Detector, path: Path | None = None, every: bool = False) -> None:
+        """Start the process that logs.
+
+        Args:
+            detector: what finds the heads of the frames that are shown.
+            path: an rrd file to write; without one the viewer is started, or the one that runs already used.
+            every: show every frame, and wait for the viewer.
+
+        Raises:
+            HeadvoxError: rerun is not installed, there is no display, or the file cannot be made.
+        """
+        check(path)
+        self._detector = detector
+        command = ["-m", "headvox.view.log", "every" if every else "newest"]
+        self._mailbox = Mailbox([*command, *([] if path is None else [str(path)])], every)
+
+    @property
+    def dropped(self) -> int:
+        """How many frames were not shown so far."""
+        return self._mailbox.dropped
+
+    def show(self, frame: Frame, result: Result) -> None:
+        """Hand over the frame that the detector has just looked at."""
+        candidates, votes = self._detector.candidates_of_last_frame()
+        self._mailbox.put(Seen(frame, result, candidates, votes, dict(self._detector.stage_ms)))
+
+    def close(self) -> None:
+        """Let what is under way be shown, and end the process; the viewer stays."""
+        self._mailbox.close()
+
+
+def check(path: Path | None) -> None:
+    """Raise what would keep frames from being shown, before anything is started.
+
+    Raises:
+        HeadvoxError: rerun is not installed, there is no display, or the file cannot be made.
+    """
+    if importlib.util.find_spec("rerun") is None:
+        raise HeadvoxError("The viewer needs rerun.", "pip install 'headvox[view]'")
+    if path is not None:
+        try:
+            path.open("ab").close()
+        except OSError as error:
+            raise HeadvoxError(f"Output {path}: {error.strerror or error}.", "Check the path.") from None
+    elif sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise HeadvoxError(
+            "There is no display to show anything on.",
+            "Write a file with --view NAME.rrd, or use headvox render.",
+        )

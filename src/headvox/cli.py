@@ -51,6 +51,7 @@ MODULES = {
         "headvox.evaluate.command",
         "measure how good it is, on the paper's scenarios and on recordings",
     ),
+    "align": ("headvox.calibrate.command", "tell where cameras stand, by the floor and by people who walk"),
     "bench": ("headvox.bench", "measure how fast it is here"),
 }
 

@@ -137,7 +137,9 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
         help="where that frame, or the one sensor, stands: metres and degrees; PITCH above 0 looks down",
     )
     group.add_argument(
-        "--extrinsics", metavar="FILE", help="TOML or JSON that tells where each RealSense camera stands"
+        "--extrinsics",
+        metavar="FILE",
+        help="TOML or JSON that tells where each camera stands: see headvox align",
     )
 
 

@@ -9,6 +9,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from headvox.calibrate.floor import wrong_floor
 from headvox.config import DetectorConfig
 from headvox.data import Frame
 from headvox.flags import config_of, sample_folder, source_options_of, tracker_config_of
@@ -44,6 +45,18 @@ class Session:
         Raises:
             HeadvoxError: no frame could be used, or a bad one with ``--strict``.
         """
+        told_floor = False
+
+        def look_at_floor(frame: Frame, result: Result) -> None:
+            nonlocal told_floor
+            if not told_floor:
+                told_floor = True
+                note = wrong_floor(frame)
+                if note is not None:
+                    self.live.note(f"headvox: {note}")
+            if on_result is not None:
+                on_result(frame, result)
+
         self.live.show("getting ready (the first time compiles, ten seconds or more)")
         warm_up(self.config)
         report = run(
@@ -55,7 +68,7 @@ class Session:
             limit=self.limit,
             on_bad=lambda index, reason: self.live.note(f"headvox: frame {index} skipped: {reason}"),
             on_frame=self.live.frame,
-            on_result=on_result,
+            on_result=look_at_floor,
         )
         if report.heads == 0 and not report.interrupted and not isinstance(self.source, RecordingSource):
             self.live.note("no head in any frame: headvox expects metres, and a world whose z points up")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -63,7 +64,7 @@ def open_source(
     from headvox.sources.cloudfile import CloudFileSource
     from headvox.sources.folder import FolderSource
     from headvox.sources.options import SourceOptions, check_unused
-    from headvox.sources.recording import FILE, RecordingSource
+    from headvox.sources.recording import FILE
 
     place = Path(path)
     if os.fspath(path).startswith("realsense:") and not place.exists():
@@ -75,14 +76,28 @@ def open_source(
         is_recording = place.name == FILE or (place / FILE).is_file()
         if not is_recording and is_bag(place):
             return _open_bag(place, options or SourceOptions(), say or _warn)
+        if is_recording:
+            return _open_recording(place if place.is_dir() else place.parent, options)
         check_unused(options, place.name)
         if place.is_dir():
-            return RecordingSource(place) if is_recording else FolderSource(place)
+            return FolderSource(place)
     except OSError as error:
         raise HeadvoxError(f"{place}: cannot be read: {error.strerror}.", "Check the path.") from None
     except ValueError as error:  # a NUL in the path
         raise HeadvoxError(f"{place}: cannot be read: {error}.", "Check the path.") from None
-    return RecordingSource(place.parent) if is_recording else CloudFileSource(place)
+    return CloudFileSource(place)
+
+
+def _open_recording(folder: Path, options: SourceOptions | None) -> Source:
+    from headvox.sources.extrinsics import read_extrinsics
+    from headvox.sources.options import check_unused
+    from headvox.sources.recording import RecordingSource
+
+    if options is None or options.extrinsics is None:
+        check_unused(options, folder.name)
+        return RecordingSource(folder)
+    check_unused(replace(options, extrinsics=None), folder.name)
+    return RecordingSource(folder, read_extrinsics(options.extrinsics))
 
 
 def _open_bag(place: Path, options: SourceOptions, say: Callable[[str], None]) -> Source:

@@ -58,8 +58,12 @@ class RecordingSource:
 
     length: int | None
 
-    def __init__(self, folder: Path) -> None:
-        """Raise HeadvoxError where recording.json is missing or says anything that cannot be used."""
+    def __init__(self, folder: Path, placed: Mapping[str, F64] | None = None) -> None:
+        """Open a folder; ``placed`` cameras stand there (T_world_camera), whatever the recording says.
+
+        Raises:
+            HeadvoxError: recording.json is missing or says anything that cannot be used, or does not know a camera.
+        """
         name = str(folder / FILE)
         content = _load(folder / FILE)
         self.name = folder.resolve().name
@@ -68,6 +72,13 @@ class RecordingSource:
         self.cameras = _cameras(content, name)
         self.frames = _frames(content, self.cameras, name)
         self.length = len(self.frames)
+        self._placed = dict(placed or {})
+        for camera in self._placed:
+            if camera not in self.cameras:
+                raise HeadvoxError(
+                    f"{name}: has no camera {camera}, only {', '.join(self.cameras)}.",
+                    "Correct the extrinsics.",
+                )
         self._open = True
 
     def __iter__(self) -> Iterator[Frame | BadFrame]:
@@ -92,7 +103,7 @@ class RecordingSource:
         intrinsics = self.cameras[shot.camera].intrinsics
         data = _read_inside(self._folder, shot.file, _most_png_bytes(intrinsics))
         depth = decode_depth(data, intrinsics.width, intrinsics.height, shot.file)
-        return DepthImage(shot.camera, depth, intrinsics, shot.T_world_camera)
+        return DepthImage(shot.camera, depth, intrinsics, self._placed.get(shot.camera, shot.T_world_camera))
 
 
 def decode_depth(data: bytes, width: int, height: int, name: str) -> U16:

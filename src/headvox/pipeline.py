@@ -6,34 +6,33 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from headvox.align import Scratch
+from headvox.check import check_frame, nothing_in_range, origins_of
 from headvox.config import DetectorConfig
 from headvox.cuda.device import BATCH, Device, DeviceLost, use_device
 from headvox.cuda.readings import Asked, Found
 from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
-from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
-from headvox.gate import candidate_reach, gate_columns, gate_tables, list_passed, shape_of_passed
-from headvox.integral import box_reach, integrate, set_corners, shape_with_margins
+from headvox.gate import gate_columns, list_passed, shape_of_passed
+from headvox.integral import integrate, set_corners, shape_with_margins
 from headvox.kernels import Threads, read_only
-from headvox.masks import SCORE_UNIT, CompiledStages, compile_cascade, load_cascade
+from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
+from headvox.memory import Memory, Stages
 from headvox.pose import fit_poses
-from headvox.refine import HAIR_M, MOST_PARTS, cells_about, fit_spheres
+from headvox.refine import HAIR_M, cells_about, fit_spheres
 from headvox.simd import LANES
 from headvox.suppress import PEAK_REACH, local_maxima, suppress_overlaps
-from headvox.visibility import camera_table, cells_of, count_states, look_about
-from headvox.vote import DROPPED, StageTables, seen_boxes, vote_masks, vote_stages
+from headvox.visibility import camera_table, count_states, look_about
+from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import (
     Lattice,
-    Marking,
     Rays,
     mark_depth,
     mark_points,
@@ -91,9 +90,9 @@ class Detector:
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
         self._threads = Threads(self.config.threads)
-        self._memory: _Memory | None = None
+        self._memory: Memory | None = None
         self._rays: dict[str, tuple[DepthImage, Lattice, Rays]] = {}
-        self._looked_at: tuple[_Memory, I32, I64] | None = None
+        self._looked_at: tuple[Memory, I32, I64] | None = None
 
     # ------------------------------------------------------------------------------------------- the public calls
 
@@ -126,7 +125,7 @@ class Detector:
         """
         if self.on_device:
             return self._detect_on_device([frame], [expected])[0]
-        _check_frame(frame)
+        check_frame(frame)
         clock = _Clock(self.stage_ms)
         memory = self._memory_for(frame)
         memory.clear()
@@ -184,7 +183,7 @@ class Detector:
     def _detect_on_device(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
         """Return the heads in up to :data:`BATCH` frames; where the GPU fails, by the CPU, and from then on."""
         for frame in frames:
-            _check_frame(frame)
+            check_frame(frame)
         clock = _Clock(self.stage_ms)
         asked = [self._asked(frame, one) for frame, one in zip(frames, expected, strict=True)]
         try:
@@ -228,7 +227,7 @@ class Detector:
         memory.dirty = (0, 0)
         self.candidates = found.candidates
         if not found.occupied:
-            raise _nothing_in_range(asked.frame, asked.lattice.region)
+            raise nothing_in_range(asked.frame, asked.lattice.region)
         memory.first = np.zeros(3, np.int64)
         memory.enter_patches(found)
         memory.make_room(len(found.cells))
@@ -242,7 +241,7 @@ class Detector:
 
     # -------------------------------------------------------------------------------------------------- the stages
 
-    def _voxelize(self, frame: Frame, memory: _Memory) -> I64:
+    def _voxelize(self, frame: Frame, memory: Memory) -> I64:
         """Enter every reading into the grid; return its lowest and highest occupied cell."""
         lattice, parts = memory.lattice, self._threads.count
         limits, shape, shift = memory.limits, lattice.shape, lattice.subdivision - 1
@@ -280,13 +279,13 @@ class Detector:
         memory.dirty = (max(int(box[0]), 0), int(box[3]) + 1)
         if box[3] < 0:
             memory.dirty = (0, 0)
-            raise _nothing_in_range(frame, lattice.region)
+            raise nothing_in_range(frame, lattice.region)
         for cells in memory.cells[1:]:
             filled = slice(*memory.dirty)
             merge(memory.cells[0][filled].reshape(-1), cells[filled].reshape(-1), counting)
         return box
 
-    def _integrate(self, memory: _Memory, occupied: I64, candidates: I64) -> npt.NDArray[Any]:
+    def _integrate(self, memory: Memory, occupied: I64, candidates: I64) -> npt.NDArray[Any]:
         """Return the integral volume about the box ``candidates``, with margins for whatever box is looked up there."""
         shape = shape_with_margins(tuple((candidates[3:] - candidates[:3] + 1).tolist()), memory.reach)
         S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
@@ -303,7 +302,7 @@ class Detector:
         self._threads.run(add_up, [(part,) for part in range(parts)])
         return S
 
-    def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: _Memory) -> I32:
+    def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: Memory) -> I32:
         parts = self._threads.count
         low, high = candidates[:3] - memory.first, candidates[3:] - memory.first + 1
         region = np.stack([low, high], axis=1).reshape(-1)
@@ -324,7 +323,7 @@ class Detector:
             list_passed(passed, region, memory.survivors)
         return memory.survivors[: self.candidates]
 
-    def _vote(self, S: npt.NDArray[Any], survivors: I32, memory: _Memory) -> I64:
+    def _vote(self, S: npt.NDArray[Any], survivors: I32, memory: Memory) -> I64:
         memory.make_room(len(survivors))
         scores, parts = memory.scores[: len(survivors)], self._threads.count
         votes = self.cascade.votes
@@ -342,7 +341,7 @@ class Detector:
         return scores
 
     def _score(
-        self, S: npt.NDArray[Any], cells: I32, seen: I32, stages: _Stages, memory: _Memory, scores: I64,
+        self, S: npt.NDArray[Any], cells: I32, seen: I32, stages: Stages, memory: Memory, scores: I64,
         all_stages: bool = False,
     ) -> None:  # fmt: skip
         """Write the score of each of ``cells`` by ``stages``; by those that ask nothing of the cameras, if not all."""
@@ -359,7 +358,7 @@ class Detector:
 
         self._threads.run(score, [(part,) for part in range(parts)])
 
-    def _suppress(self, S: npt.NDArray[Any], survivors: I32, scores: I64, memory: _Memory) -> I64:
+    def _suppress(self, S: npt.NDArray[Any], survivors: I32, scores: I64, memory: Memory) -> I64:
         shape = tuple(n - 1 for n in S.shape)
         index = memory.index[: math.prod(shape)].reshape(shape)
         reach = PEAK_REACH[self.cascade.gate.spacing]
@@ -369,7 +368,7 @@ class Detector:
         return peaks
 
     def _judge(
-        self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: _Memory,
+        self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: Memory,
         expected: Expected | None,
     ) -> tuple[I32, I64, I64, int]:  # fmt: skip
         """Look closer at the peaks, and let those through that reach the cascade's threshold.
@@ -386,11 +385,11 @@ class Detector:
         kept = self._kept(cells, scores, threshold, memory, expected)
         return cells[kept], scores[kept], peaks[kept], threshold
 
-    def _sees(self, frame: Frame, memory: _Memory) -> bool:
+    def _sees(self, frame: Frame, memory: Memory) -> bool:
         """Whether the judge can ask the cameras what they saw: not with clouds, of which nobody knows what is free."""
         return memory.sees and len(frame.depths) > 0 and not frame.clouds
 
-    def _threshold(self, frame: Frame, memory: _Memory) -> int:
+    def _threshold(self, frame: Frame, memory: Memory) -> int:
         """Return the least score of a head, in steps."""
         cascade, least = self.cascade.source, self.config.min_score
         if least is None:
@@ -403,7 +402,7 @@ class Detector:
         return math.floor(self.config.score_slack * SCORE_UNIT)
 
     def _kept(
-        self, cells: I32, scores: I64, threshold: int, memory: _Memory, expected: Expected | None
+        self, cells: I32, scores: I64, threshold: int, memory: Memory, expected: Expected | None
     ) -> npt.NDArray[np.bool_]:
         """Return which of the peaks reach the threshold, or nearly so where a head is expected."""
         kept: npt.NDArray[np.bool_] = scores >= threshold
@@ -413,7 +412,7 @@ class Detector:
         return kept
 
     def _best_about(
-        self, S: npt.NDArray[Any], cells: I32, judge: _Stages, memory: _Memory
+        self, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory
     ) -> tuple[I32, I64, I64]:
         """Move each peak to the best voxel about it; return cells, scores and which of the peaks they were."""
         around = AROUND[self.cascade.gate.spacing]
@@ -430,7 +429,7 @@ class Detector:
         return about[best], scores[best], best // len(around)
 
     def _look_about(
-        self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: _Stages, memory: _Memory
+        self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory
     ) -> I64:
         """Return the scores of all stages of the judge, with what the cameras saw empty and hidden."""
         states = np.zeros((len(cells), len(judge.offsets)), np.uint8)
@@ -444,7 +443,7 @@ class Detector:
         self._score(S, cells, seen, judge, memory, scores, all_stages=True)
         return scores
 
-    def _is_expected(self, cells: I32, expected: Expected, memory: _Memory) -> npt.NDArray[np.bool_]:
+    def _is_expected(self, cells: I32, expected: Expected, memory: Memory) -> npt.NDArray[np.bool_]:
         """Whether each of ``cells`` is within reach of any place where a head is expected."""
         centres = memory.lattice.centres(cells + memory.first)
         away = np.linalg.norm(centres[:, None] - expected.centres, axis=2)
@@ -458,7 +457,7 @@ class Detector:
         scores: I64,
         peaks: I64,
         least: int,
-        memory: _Memory,
+        memory: Memory,
         expected: Expected | None,
     ) -> Heads:
         count = len(cells)
@@ -475,7 +474,7 @@ class Detector:
                 memory.cells[0], cells, lattice.voxel_m, lattice.subdivision, counting, memory.points, spheres
             )
             centres = centres + spheres[:, :3]
-            if len(_origins(frame)):
+            if len(origins_of(frame)):
                 centres[:, 2] -= HAIR_M
             radii = spheres[:, 3]
         kept = suppress_overlaps(centres, scores, SAME_HEAD_M)
@@ -492,7 +491,7 @@ class Detector:
         )
         return self._fit_poses(frame, heads, memory, expected) if self.config.refine == "pose" else heads
 
-    def _fit_poses(self, frame: Frame, heads: Heads, memory: _Memory, expected: Expected | None) -> Heads:
+    def _fit_poses(self, frame: Frame, heads: Heads, memory: Memory, expected: Expected | None) -> Heads:
         """Align the head template to the points about each of the best heads; the others stay as they are."""
         best = slice(0, MOST_POSES)
         poses = fit_poses(frame, heads.centres[best], memory.scratch, self._threads, expected)
@@ -518,20 +517,22 @@ class Detector:
 
     # -------------------------------------------------------------------------------------------- working memory
 
-    def _memory_for(self, frame: Frame) -> _Memory:
+    def _memory_for(self, frame: Frame) -> Memory:
         """Return the working memory, made anew only when the region moved."""
         region = self._region(frame)
         if self._memory is None or self._memory.lattice.region != region:
             lattice = Lattice.over(region, self.cascade.voxel_m, self.cascade.source.subdivision)
             if self._memory is None or self._memory.lattice.shape != lattice.shape:
-                self._memory = _Memory(lattice, self)
+                self._memory = Memory(
+                    lattice, self.cascade, self.config.threads, self.config.refine == "pose"
+                )
             self._memory.place(lattice)
         return self._memory
 
     def _region(self, frame: Frame) -> Region:
         config, centre = self.config, self.config.centre
         if centre is None:
-            origins = _origins(frame)
+            origins = origins_of(frame)
             x, y, z = origins.mean(axis=0).tolist() if len(origins) else (0.0, 0.0, 0.0)
             centre = (x, y, z)
         return Region(centre, config.max_range_m, config.min_height_m, config.max_height_m)
@@ -549,116 +550,6 @@ class Detector:
         rays = Rays.of(image, lattice)
         self._rays[image.name] = (replace(image, T_world_camera=image.T_world_camera.copy()), lattice, rays)
         return rays
-
-
-class _Memory:
-    """The buffers of a detector: nothing as large as a frame is allocated per frame."""
-
-    def __init__(self, lattice: Lattice, detector: Detector) -> None:
-        cascade, threads = detector.cascade, detector.config.threads
-        counting = cascade.source.counting
-        cell_type = np.uint32 if counting else np.uint8
-        sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
-        cells = math.prod(lattice.shape)
-        self.place(lattice)
-        self.dirty: tuple[int, int] | None = (0, 0)
-        self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
-        self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
-        self.marking = [Marking.of(LANES) for _ in range(threads)]
-        tables = [part.boxes for part in (cascade.gate, cascade.stages) if part is not None]
-        if cascade.judge is not None:  # it looks at the neighbours of candidates, too
-            tables += [cascade.judge.boxes + one for one in (-1, 1)]
-        self.reach = box_reach(np.concatenate(tables))
-        shape = shape_with_margins(lattice.shape, self.reach)
-        self.S = np.empty(math.prod(shape), sum_type)
-        self.spare = [np.zeros(LANES, cell_type) for _ in range(threads)]
-        self.row = [np.zeros(shape[2] + LANES, sum_type) for _ in range(threads)]
-        self.index = np.zeros(math.prod(shape), np.int32)
-        self.first = np.zeros(3, np.int64)
-        """The cell that the integral volume begins at."""
-        self.gate = gate_tables(cascade.gate, self.S.dtype)
-        self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.uint64)
-        self.candidate_reach = candidate_reach(cascade.gate)
-        whole = np.array([0, lattice.shape[0], 0, lattice.shape[1], 0, lattice.shape[2]])
-        self.passed = np.empty(math.prod(shape_of_passed(whole)), np.uint32)
-        self.survivors = np.empty((4096, 3), np.int32)
-        self.points = np.empty((MOST_PARTS, 3))
-        self.unseen = np.zeros((1, 1, 2), np.int32)
-        self.sees = cascade.source.sees  # asks every tree: not for every frame
-        self.search = _Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
-        self.judge = _Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
-        self.scratch = [Scratch.new() for _ in range(threads if detector.config.refine == "pose" else 0)]
-        self.scores: I64 = np.empty(0, np.int64)
-        self.make_room(4096)
-
-    def clear(self) -> None:
-        """Empty the grid of the last frame: now, so that the cells are in the cache when they are marked."""
-        if self.dirty is None:  # a frame was interrupted midway, and has left something anywhere
-            for cells in self.cells:
-                cells[:] = 0
-        else:
-            self.cells[0][self.dirty[0] : self.dirty[1]] = 0
-        self.dirty = None
-
-    def enter_patches(self, found: Found) -> None:
-        """Enter the cells about the peaks that the device found into the grid, for the fit of spheres."""
-        cells, reach = self.cells[0], found.patches.shape[1] // 2
-        has_patch = found.patch_of >= 0
-        patches = found.patches[found.patch_of[has_patch]]
-        for centre, patch in zip(found.cells[has_patch].tolist(), patches, strict=True):
-            low = [max(c - reach, 0) for c in centre]
-            high = [min(c + reach + 1, n) for c, n in zip(centre, cells.shape, strict=True)]
-            inside = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-            from_patch = tuple(
-                slice(a - c + reach, b - c + reach) for a, b, c in zip(low, high, centre, strict=True)
-            )
-            cells[inside] = patch[from_patch]
-            first, after = self.dirty if self.dirty and self.dirty != (0, 0) else (low[0], high[0])
-            self.dirty = (min(first, low[0]), max(after, high[0]))
-
-    def candidates_about(self, occupied: I64) -> I64:
-        """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""
-        box = occupied + self.candidate_reach
-        return np.concatenate([np.maximum(box[:3], 0), np.minimum(box[3:], np.array(self.lattice.shape) - 1)])
-
-    def place(self, lattice: Lattice) -> None:
-        """Stand for another region of the same shape."""
-        self.lattice = lattice
-        self.limits = lattice.limits()
-
-    def make_room_for_width(self, pixels: int) -> None:
-        """Have room for images as wide as that."""
-        if len(self.marking[0].codes) < pixels + LANES:
-            self.marking = [Marking.of(pixels) for _ in self.marking]
-
-    def make_room(self, candidates: int) -> None:
-        """Have room for as many candidates."""
-        if len(self.scores) < candidates:
-            self.scores = np.empty(2 * candidates, np.int64)
-            self.alive = np.empty(2 * candidates, np.int64)
-            self.yaws = np.zeros(2 * candidates, np.int32)
-            self.peaks = np.empty(2 * candidates, np.int64)
-
-
-@dataclass(frozen=True, slots=True)
-class _Stages:
-    """Stages as tables, with the working memory of each thread, and the cells that they ask the cameras for."""
-
-    compiled: CompiledStages
-    tables: tuple[npt.NDArray[Any], ...]
-    memory: list[tuple[npt.NDArray[Any], ...]]
-    corners: npt.NDArray[np.uint64]
-    offsets: I32
-    offset_start: I32
-
-    @classmethod
-    def of(cls, compiled: CompiledStages, sum_type: np.dtype[Any], threads: int) -> _Stages:
-        stages = StageTables.of(compiled, sum_type)
-        boxes, _ = seen_boxes(compiled)
-        memory = [stages.memory() for _ in range(threads)]
-        return cls(
-            compiled, stages.tables, memory, np.empty((len(compiled.boxes), 8), np.uint64), *cells_of(boxes)
-        )
 
 
 def _warn(text: str) -> None:
@@ -679,81 +570,3 @@ class _Clock:
 def _share(count: int, part: int, parts: int) -> tuple[int, int]:
     """Return the half-open range of ``count`` things that the ``part``-th of ``parts`` threads does."""
     return count * part // parts, count * (part + 1) // parts
-
-
-def _origins(frame: Frame) -> F64:
-    """Return where the sensors of ``frame`` stand, (S, 3), as far as is known."""
-    placed = [cloud.T_world_sensor for cloud in frame.clouds if cloud.T_world_sensor is not None]
-    placed += [image.T_world_camera for image in frame.depths]
-    return np.array([T[:3, 3] for T in placed], dtype=np.float64).reshape(-1, 3)
-
-
-def _check_frame(frame: Frame) -> None:
-    if not frame.clouds and not frame.depths:
-        raise HeadvoxError(
-            "The frame has neither points nor depth images.", "Give at least one sensor's reading."
-        )
-    for cloud in frame.clouds:
-        points = cloud.points
-        if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
-            shape = getattr(points, "shape", type(points).__name__)
-            raise HeadvoxError(
-                f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them."
-            )
-        if points.dtype != np.float32 or not points.flags.c_contiguous:
-            raise HeadvoxError(
-                f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype} in strides {points.strides}.",
-                "Use np.ascontiguousarray(points, dtype=np.float32).",
-            )
-        if len(points) == 0:
-            raise HeadvoxError(f"{cloud.name}: the cloud is empty.", "Is the sensor running?")
-        if cloud.T_world_sensor is not None:
-            as_rigid(cloud.T_world_sensor, f"{cloud.name}: T_world_sensor")
-    for image in frame.depths:
-        depth, camera = image.depth, image.intrinsics
-        if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
-            got = f"{getattr(depth, 'dtype', type(depth).__name__)} {getattr(depth, 'shape', '')}"
-            expected = "expected a (height, width) uint16 depth image"
-            raise HeadvoxError(f"{image.name}: {expected}, got {got}.", "Convert it.")
-        if depth.size == 0 or depth.shape != (camera.height, camera.width):
-            raise HeadvoxError(
-                f"{image.name}: the image is {depth.shape[1]}x{depth.shape[0]}, its camera "
-                f"{camera.width}x{camera.height}.",
-                "Give the intrinsics of this image size.",
-            )
-        if not (camera.fx > 0 and camera.fy > 0 and camera.depth_scale > 0):
-            raise HeadvoxError(
-                f"{image.name}: fx, fy and depth_scale must be above 0.", "Check the intrinsics."
-            )
-        as_rigid(image.T_world_camera, f"{image.name}: T_world_camera")
-
-
-def _nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
-    """Say why no point was kept: nothing measured at all, another unit, or another place."""
-    where = f"within {region.radius_m:g} m of ({', '.join(f'{v:.2f}' for v in region.centre)})"
-    for cloud in frame.clouds:
-        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
-        finite = distance[np.isfinite(distance)]
-        if len(finite) == 0:
-            what = f"{cloud.name}: all {len(cloud.points)} points are NaN or infinite."
-            return HeadvoxError(what, "Is the sensor covered, or too near?")
-        middle = float(np.median(finite))
-        if middle > 100.0:
-            return HeadvoxError(
-                f"{cloud.name}: half of the points are more than {middle:.0f} m away: are they in millimetres?",
-                "headvox expects metres: scale them by 0.001.",
-            )
-        return HeadvoxError(
-            f"{cloud.name}: none of {len(cloud.points)} points is {where} and between {region.min_height_m:g} m and "
-            f"{region.max_height_m:g} m high (nearest: {finite.min():.2f} m from the origin of its frame).",
-            "Set centre, max_range_m, min_height_m or max_height_m, or give the sensor's transform.",
-        )
-    if all(not image.depth.any() for image in frame.depths):
-        return HeadvoxError(
-            f"{frame.depths[0].name}: the depth image has no return at all.", "Is the sensor running?"
-        )
-    return HeadvoxError(
-        f"{frame.depths[0].name}: no return is {where} and between {region.min_height_m:g} m and "
-        f"{region.max_height_m:g} m high.",
-        "Check T_world_camera and depth_scale, or set max_range_m, min_height_m or max_height_m.",
-    )

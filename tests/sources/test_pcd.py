@@ -51,6 +51,17 @@ def test_padding_is_left_out_of_compressed_files():
     np.testing.assert_array_equal(read_pcd(padded, "a.pcd").points, MANY)
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_a_field_of_count_0_takes_no_room(encoding):
+    data = pcd(MANY, encoding)
+    with_empty = data.replace(b"FIELDS rgb x y pair z label", b"FIELDS rgb x y pair z label nothing")
+    with_empty = with_empty.replace(b"SIZE 4 4 4 4 4 1", b"SIZE 4 4 4 4 4 1 4")
+    with_empty = with_empty.replace(b"TYPE U F F F F U", b"TYPE U F F F F U F")
+    with_empty = with_empty.replace(b"COUNT 1 1 1 2 1 1", b"COUNT 1 1 1 2 1 1 0")
+    assert len(with_empty) > len(data)
+    np.testing.assert_array_equal(read_pcd(with_empty, "a.pcd").points, read_pcd(data, "a.pcd").points)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

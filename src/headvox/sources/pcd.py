@@ -115,6 +115,7 @@ def _fields(entries: dict[str, list[str]], name: str) -> tuple[Field, ...]:
     fields = tuple(
         Field(label, np.dtype(f"<{kind.lower()}{size}"), count)
         for label, kind, size, count in zip(names, types, sizes, counts, strict=True)
+        if count > 0  # such a field takes no room
     )
     for axis in "xyz":
         if [f.count for f in fields if f.name == axis] != [1]:

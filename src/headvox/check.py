@@ -1,0 +1,89 @@
+"""What a frame has to be before anything is looked for in it, and why there may be nothing to look at."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from headvox.data import F64, Frame
+from headvox.errors import HeadvoxError
+from headvox.frames import as_rigid
+from headvox.fuse import Region
+
+
+def origins_of(frame: Frame) -> F64:
+    """Return where the sensors of ``frame`` stand, (S, 3), as far as is known."""
+    placed = [cloud.T_world_sensor for cloud in frame.clouds if cloud.T_world_sensor is not None]
+    placed += [image.T_world_camera for image in frame.depths]
+    return np.array([T[:3, 3] for T in placed], dtype=np.float64).reshape(-1, 3)
+
+
+def check_frame(frame: Frame) -> None:
+    """Raise HeadvoxError where a reading has another shape or type than it should, or a place that is not rigid."""
+    if not frame.clouds and not frame.depths:
+        raise HeadvoxError(
+            "The frame has neither points nor depth images.", "Give at least one sensor's reading."
+        )
+    for cloud in frame.clouds:
+        points = cloud.points
+        if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
+            shape = getattr(points, "shape", type(points).__name__)
+            raise HeadvoxError(
+                f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them."
+            )
+        if points.dtype != np.float32 or not points.flags.c_contiguous:
+            raise HeadvoxError(
+                f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype} in strides {points.strides}.",
+                "Use np.ascontiguousarray(points, dtype=np.float32).",
+            )
+        if len(points) == 0:
+            raise HeadvoxError(f"{cloud.name}: the cloud is empty.", "Is the sensor running?")
+        if cloud.T_world_sensor is not None:
+            as_rigid(cloud.T_world_sensor, f"{cloud.name}: T_world_sensor")
+    for image in frame.depths:
+        depth, camera = image.depth, image.intrinsics
+        if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
+            got = f"{getattr(depth, 'dtype', type(depth).__name__)} {getattr(depth, 'shape', '')}"
+            expected = "expected a (height, width) uint16 depth image"
+            raise HeadvoxError(f"{image.name}: {expected}, got {got}.", "Convert it.")
+        if depth.size == 0 or depth.shape != (camera.height, camera.width):
+            raise HeadvoxError(
+                f"{image.name}: the image is {depth.shape[1]}x{depth.shape[0]}, its camera "
+                f"{camera.width}x{camera.height}.",
+                "Give the intrinsics of this image size.",
+            )
+        if not (camera.fx > 0 and camera.fy > 0 and camera.depth_scale > 0):
+            raise HeadvoxError(
+                f"{image.name}: fx, fy and depth_scale must be above 0.", "Check the intrinsics."
+            )
+        as_rigid(image.T_world_camera, f"{image.name}: T_world_camera")
+
+
+def nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
+    """Say why no point was kept: nothing measured at all, another unit, or another place."""
+    where = f"within {region.radius_m:g} m of ({', '.join(f'{v:.2f}' for v in region.centre)})"
+    for cloud in frame.clouds:
+        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
+        finite = distance[np.isfinite(distance)]
+        if len(finite) == 0:
+            what = f"{cloud.name}: all {len(cloud.points)} points are NaN or infinite."
+            return HeadvoxError(what, "Is the sensor covered, or too near?")
+        middle = float(np.median(finite))
+        if middle > 100.0:
+            return HeadvoxError(
+                f"{cloud.name}: half of the points are more than {middle:.0f} m away: are they in millimetres?",
+                "headvox expects metres: scale them by 0.001.",
+            )
+        return HeadvoxError(
+            f"{cloud.name}: none of {len(cloud.points)} points is {where} and between {region.min_height_m:g} m and "
+            f"{region.max_height_m:g} m high (nearest: {finite.min():.2f} m from the origin of its frame).",
+            "Set centre, max_range_m, min_height_m or max_height_m, or give the sensor's transform.",
+        )
+    if all(not image.depth.any() for image in frame.depths):
+        return HeadvoxError(
+            f"{frame.depths[0].name}: the depth image has no return at all.", "Is the sensor running?"
+        )
+    return HeadvoxError(
+        f"{frame.depths[0].name}: no return is {where} and between {region.min_height_m:g} m and "
+        f"{region.max_height_m:g} m high.",
+        "Check T_world_camera and depth_scale, or set max_range_m, min_height_m or max_height_m.",
+    )

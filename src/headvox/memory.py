@@ -1,0 +1,134 @@
+"""The working memory of a detector: made once, used for every frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.align import Scratch
+from headvox.cuda.readings import Found
+from headvox.gate import candidate_reach, gate_tables, shape_of_passed
+from headvox.integral import box_reach, shape_with_margins
+from headvox.masks import CompiledCascade, CompiledStages
+from headvox.refine import MOST_PARTS
+from headvox.simd import LANES
+from headvox.visibility import cells_of
+from headvox.vote import StageTables, seen_boxes
+from headvox.voxelize import Lattice, Marking
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+
+
+class Memory:
+    """The buffers of a detector: nothing as large as a frame is allocated per frame."""
+
+    def __init__(self, lattice: Lattice, cascade: CompiledCascade, threads: int, poses: bool) -> None:
+        counting = cascade.source.counting
+        cell_type = np.uint32 if counting else np.uint8
+        sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
+        cells = math.prod(lattice.shape)
+        self.place(lattice)
+        self.dirty: tuple[int, int] | None = (0, 0)
+        self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
+        self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
+        self.marking = [Marking.of(LANES) for _ in range(threads)]
+        tables = [part.boxes for part in (cascade.gate, cascade.stages) if part is not None]
+        if cascade.judge is not None:  # it looks at the neighbours of candidates, too
+            tables += [cascade.judge.boxes + one for one in (-1, 1)]
+        self.reach = box_reach(np.concatenate(tables))
+        shape = shape_with_margins(lattice.shape, self.reach)
+        self.S = np.empty(math.prod(shape), sum_type)
+        self.spare = [np.zeros(LANES, cell_type) for _ in range(threads)]
+        self.row = [np.zeros(shape[2] + LANES, sum_type) for _ in range(threads)]
+        self.index = np.zeros(math.prod(shape), np.int32)
+        self.first = np.zeros(3, np.int64)
+        """The cell that the integral volume begins at."""
+        self.gate = gate_tables(cascade.gate, self.S.dtype)
+        self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.uint64)
+        self.candidate_reach = candidate_reach(cascade.gate)
+        whole = np.array([0, lattice.shape[0], 0, lattice.shape[1], 0, lattice.shape[2]])
+        self.passed = np.empty(math.prod(shape_of_passed(whole)), np.uint32)
+        self.survivors = np.empty((4096, 3), np.int32)
+        self.points = np.empty((MOST_PARTS, 3))
+        self.unseen = np.zeros((1, 1, 2), np.int32)
+        self.sees = cascade.source.sees  # asks every tree: not for every frame
+        self.search = Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
+        self.judge = Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
+        self.scratch = [Scratch.new() for _ in range(threads if poses else 0)]
+        self.scores: I64 = np.empty(0, np.int64)
+        self.make_room(4096)
+
+    def clear(self) -> None:
+        """Empty the grid of the last frame: now, so that the cells are in the cache when they are marked."""
+        if self.dirty is None:  # a frame was interrupted midway, and has left something anywhere
+            for cells in self.cells:
+                cells[:] = 0
+        else:
+            self.cells[0][self.dirty[0] : self.dirty[1]] = 0
+        self.dirty = None
+
+    def enter_patches(self, found: Found) -> None:
+        """Enter the cells about the peaks that the device found into the grid, for the fit of spheres."""
+        cells, reach = self.cells[0], found.patches.shape[1] // 2
+        has_patch = found.patch_of >= 0
+        patches = found.patches[found.patch_of[has_patch]]
+        for centre, patch in zip(found.cells[has_patch].tolist(), patches, strict=True):
+            low = [max(c - reach, 0) for c in centre]
+            high = [min(c + reach + 1, n) for c, n in zip(centre, cells.shape, strict=True)]
+            inside = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+            from_patch = tuple(
+                slice(a - c + reach, b - c + reach) for a, b, c in zip(low, high, centre, strict=True)
+            )
+            cells[inside] = patch[from_patch]
+            first, after = self.dirty if self.dirty and self.dirty != (0, 0) else (low[0], high[0])
+            self.dirty = (min(first, low[0]), max(after, high[0]))
+
+    def candidates_about(self, occupied: I64) -> I64:
+        """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""
+        box = occupied + self.candidate_reach
+        return np.concatenate([np.maximum(box[:3], 0), np.minimum(box[3:], np.array(self.lattice.shape) - 1)])
+
+    def place(self, lattice: Lattice) -> None:
+        """Stand for another region of the same shape."""
+        self.lattice = lattice
+        self.limits = lattice.limits()
+
+    def make_room_for_width(self, pixels: int) -> None:
+        """Have room for images as wide as that."""
+        if len(self.marking[0].codes) < pixels + LANES:
+            self.marking = [Marking.of(pixels) for _ in self.marking]
+
+    def make_room(self, candidates: int) -> None:
+        """Have room for as many candidates."""
+        if len(self.scores) < candidates:
+            self.scores = np.empty(2 * candidates, np.int64)
+            self.alive = np.empty(2 * candidates, np.int64)
+            self.yaws = np.zeros(2 * candidates, np.int32)
+            self.peaks = np.empty(2 * candidates, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """Stages as tables, with the working memory of each thread, and the cells that they ask the cameras for."""
+
+    compiled: CompiledStages
+    tables: tuple[npt.NDArray[Any], ...]
+    memory: list[tuple[npt.NDArray[Any], ...]]
+    corners: npt.NDArray[np.uint64]
+    offsets: I32
+    offset_start: I32
+
+    @classmethod
+    def of(cls, compiled: CompiledStages, sum_type: np.dtype[Any], threads: int) -> Stages:
+        """Return ``compiled`` with the memory for volumes of ``sum_type``."""
+        stages = StageTables.of(compiled, sum_type)
+        boxes, _ = seen_boxes(compiled)
+        memory = [stages.memory() for _ in range(threads)]
+        return cls(
+            compiled, stages.tables, memory, np.empty((len(compiled.boxes), 8), np.uint64), *cells_of(boxes)
+        )

@@ -47,7 +47,7 @@ def start() -> None:
     """
     if _listens():
         return
-    # Without --bind, it would listen to the whole network.
+    # Without --bind, it would listen to the whole network. It outlives us: it must not hold our output open.
     command = [
         program(), "--bind", "127.0.0.1", "--port", str(PORT), "--memory-limit", MEMORY,
         "--server-memory-limit", SERVER_MEMORY, "--expect-data-soon",

@@ -18,8 +18,8 @@ from headvox.calibrate.floor import camera_points, find_floor, level, stated, wr
 from headvox.calibrate.rig import place
 from headvox.data import Frame
 from headvox.errors import HeadvoxError
-from headvox.flags import sample_folder
 from headvox.frames import inverse, transform
+from headvox.sample import sample_folder
 from headvox.sources import open_source
 from headvox.sources.extrinsics import read_extrinsics
 from headvox.sources.recording import RecordingSource

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from headvox.data import Intrinsics as Intrinsics
     from headvox.errors import HeadvoxError as HeadvoxError
     from headvox.pipeline import Detector as Detector
+    from headvox.sample import sample_folder as sample_folder
     from headvox.sources import open_source as open_source
     from headvox.track import Tracker as Tracker
 
@@ -31,6 +32,7 @@ _HOME = {
     "Intrinsics": "headvox.data",
     "Tracker": "headvox.track",
     "open_source": "headvox.sources",
+    "sample_folder": "headvox.sample",
 }
 
 __all__ = ["__version__", *_HOME]

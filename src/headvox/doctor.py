@@ -15,7 +15,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from headvox import __version__
-from headvox.flags import GOOD, KNOWN_ERROR, add_command, sample_folder
+from headvox.flags import GOOD, KNOWN_ERROR, add_command
+from headvox.sample import sample_folder
 from headvox.table import printable, table
 
 if TYPE_CHECKING:

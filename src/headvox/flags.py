@@ -25,14 +25,6 @@ class UsageError(Exception):
     """The flags do not go together."""
 
 
-def sample_folder() -> Path:
-    """Return the recording that ships with headvox."""
-    sample = Path(__file__).parent / "assets" / "sample"
-    if not sample.is_dir():
-        raise HeadvoxError("This headvox has no sample recording in it.", "Give a SOURCE: headvox run PATH.")
-    return sample
-
-
 def config_of(args: argparse.Namespace) -> DetectorConfig:
     """Return the settings of the detector: flags beat the file, the file beats the defaults."""
     from headvox.config import DetectorConfig, load_config

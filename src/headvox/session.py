@@ -12,10 +12,11 @@ from pathlib import Path
 from headvox.calibrate.floor import wrong_floor
 from headvox.config import DetectorConfig
 from headvox.data import Frame
-from headvox.flags import config_of, sample_folder, source_options_of, tracker_config_of
+from headvox.flags import config_of, source_options_of, tracker_config_of
 from headvox.live import Live
 from headvox.pipeline import Detector
 from headvox.run import Report, run
+from headvox.sample import sample_folder
 from headvox.sinks import Result, Sink
 from headvox.sources import Source, open_source
 from headvox.sources.recording import RecordingSource

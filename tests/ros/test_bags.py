@@ -11,8 +11,8 @@ from bag_writers import KINDS, NS, Maker, write_bag
 
 from headvox.data import BadFrame, Frame, Intrinsics
 from headvox.errors import HeadvoxError, Undecided
-from headvox.flags import sample_folder
 from headvox.ros import bagfile
+from headvox.sample import sample_folder
 from headvox.sources import open_source
 from headvox.sources.options import SourceOptions, mount
 

@@ -21,11 +21,11 @@ from headvox.flags import (
     add_settings,
     config_of,
     number,
-    sample_folder,
     tracker_config_of,
     whole_number,
 )
 from headvox.live import Live
+from headvox.sample import sample_folder
 from headvox.table import printable
 from headvox.workers import Workers, add_flags, of_flags
 

@@ -30,6 +30,7 @@ setup(
             f"cloud_concatenate = {NAME}.cloud_concatenate:main",
             f"play_recording = {NAME}.play_recording:main",
             f"scenario = {NAME}.scenario:main",
+            f"endurance = {NAME}.endurance:main",
         ]
     },
 )

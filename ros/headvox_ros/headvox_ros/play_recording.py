@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ class Player(Node):
             again_ns = since_ns if not self.rewind else frame.stamp_ns - self.frames[0].stamp_ns
             now_s = 1e-9 * since_ns
             missing = {name for name, begin, end in gone if begin <= now_s < end}
-            self._publish(frame, start_ns + again_ns, missing)
+            self.publish(frame, start_ns + again_ns, missing)
         print(f"done, {skipped} frames skipped", flush=True)
 
     def _schedule(self) -> Iterator[tuple[Frame, int]]:
@@ -139,7 +139,8 @@ class Player(Node):
         as_recorded = (last - first) // (count - 1) if count > 1 else NS // 10
         return int(NS / self.rate_hz) if self.rate_hz > 0.0 else as_recorded
 
-    def _publish(self, frame: Frame, stamp_ns: int, missing: set[str]) -> None:
+    def publish(self, frame: Frame, stamp_ns: int, missing: Container[str] = ()) -> None:
+        """Publish what the cameras see in a frame, but those that are ``missing``, with a stamp."""
         stamp = Time(sec=stamp_ns // NS, nanosec=stamp_ns % NS)
         if self._clock_out is not None:
             self._clock_out.publish(Clock(clock=stamp))

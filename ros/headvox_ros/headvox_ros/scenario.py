@@ -9,14 +9,13 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -29,10 +28,9 @@ from headvox.evaluate.truth import TrueHeads, read_truth
 from headvox.ros.messages import stamp_ns
 from headvox.ros.synchronise import NS
 from headvox.sources import open_source
+from headvox_ros import processes
 
 INPUTS = {"depth": ("depths", "depth/image_rect_raw"), "cloud": ("clouds", "depth/points")}
-PROFILE = "config/fastdds_large_clouds.xml"
-START_S = 90.0  # the first run compiles
 RULES = Rules()
 
 
@@ -57,37 +55,42 @@ class Heard:
         self.rows += [{row.key: row.value for row in status.values} for status in message.status]
 
 
-def play(recording: str, sensors: str, rate_hz: float, loops: int, silent: str) -> Heard:
+def play(
+    recording: str,
+    sensors: str,
+    rate_hz: float,
+    loops: int,
+    silent: str = "",
+    reliability: str = "best_effort",
+) -> Heard:
     """Run node and player, and return what was heard."""
     parameter, topic = INPUTS[sensors]
-    cameras = sorted(
-        {image.name for frame in open_source(recording) for image in getattr(frame, "depths", ())}
-    )
-    topics = ",".join(f"'/{camera}/{topic}'" for camera in cameras)
+    topics = processes.topics(recording, topic)
     with tempfile.TemporaryFile("w+") as said:
-        node = _process("head_detector", [f"{parameter}:=[{topics}]", "target_frame:=world"], said)
+        node = processes.start(
+            "head_detector",
+            [f"{parameter}:={topics}", "target_frame:=world", f"reliability:={reliability}"],
+            said,
+        )
         player = None
         listener = rclpy.create_node("scenario")
         heard = Heard()
         listener.create_subscription(PoseArray, "/head_detector/poses", heard.on_poses, 10)
         listener.create_subscription(DiagnosticArray, "/diagnostics", heard.on_diagnostics, 10)
         try:
-            _spin_until(listener, lambda: bool(heard.rows), START_S, node)
+            processes.spin_until(listener, lambda: bool(heard.rows), processes.START_S, node)
             settings = [f"recording:={recording}", f"rate_hz:={rate_hz}", f"loops:={loops}", "delay_s:=2.0"]
             settings += [
                 f"clouds:={sensors == 'cloud'}",
                 f"depths:={sensors == 'depth'}",
-                "reliability:=best_effort",
+                f"reliability:={reliability}",
             ]
             settings += [f"silent:=['{silent}']"]
-            player = _process("play_recording", settings, said)
-            _spin_until(listener, lambda: player.poll() is not None, float("inf"), node)
-            _spin_until(listener, lambda: False, 1.5, node)
+            player = processes.start("play_recording", settings, said)
+            processes.spin_until(listener, lambda: player.poll() is not None, float("inf"), node)
+            processes.spin_until(listener, lambda: False, 1.5, node)
         finally:
-            for process in (player, node):
-                if process is not None and process.poll() is None:
-                    process.terminate()
-                    process.wait(20.0)
+            processes.end(process for process in (player, node) if process is not None)
             listener.destroy_node()
         said.seek(0)
         text = said.read()
@@ -96,19 +99,6 @@ def play(recording: str, sensors: str, rate_hz: float, loops: int, silent: str) 
         raise HeadvoxError(f"The nodes did not run: {text.strip()[-500:]}", "")
     heard.first_ns, heard.skipped = int(played[1]), int(played[2])
     return heard
-
-
-def _process(module: str, parameters: Sequence[str], said: IO[str]) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", f"headvox_ros.{module}", "--ros-args"]
-    for parameter in parameters:
-        command += ["-p", parameter]
-    return subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, text=True)
-
-
-def _spin_until(listener: Any, happened: Any, seconds: float, node: subprocess.Popen[str]) -> None:
-    end = time.monotonic() + seconds
-    while not happened() and time.monotonic() < end and node.poll() is None:
-        rclpy.spin_once(listener, timeout_sec=0.1)
 
 
 def report(recording: str, heard: Heard, rate_hz: float, loops: int) -> dict[str, float]:
@@ -137,6 +127,7 @@ def report(recording: str, heard: Heard, rate_hz: float, loops: int) -> dict[str
         "frames": loops * len(stamps),
         "frames the player skipped": heard.skipped,
         "frames answered": len(delays),
+        "frames left out for fresher ones": max(int(row["replaced_by_fresher"]) for row in heard.rows),
         "answers a second": (len(came) - 1) / (1e-9 * float(came[-1] - came[0])) if len(came) > 1 else 0.0,
         "longest gap [ms]": 1e-6 * float(np.diff(came).max(initial=0)),
         "arrival to publish, p50 [ms]": float(np.median([float(row["latency_p50_ms"]) for row in windows])),
@@ -155,16 +146,6 @@ def _match(centres: np.ndarray[Any, Any], true: TrueHeads) -> Match:
     return match(centres, true.centres, ~true.ignored, RULES)
 
 
-def _profile() -> Path:
-    """Return the Fast DDS profile: beside the sources, or where colcon installed it."""
-    here = Path(__file__).resolve()
-    installed = [parent / "share" / "headvox_ros" / PROFILE for parent in here.parents]
-    found = [path for path in (here.parents[1] / PROFILE, *installed) if path.is_file()]
-    if not found:
-        raise HeadvoxError(f"There is no {PROFILE}.", "Build the package with colcon.")
-    return found[0]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -180,8 +161,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     try:
-        os.environ.setdefault("FASTDDS_DEFAULT_PROFILES_FILE", str(_profile()))
-        rclpy.init()
+        os.environ.setdefault("FASTDDS_DEFAULT_PROFILES_FILE", str(processes.profile()))
+        processes.init()
         heard = play(args.recording, args.input, args.rate, args.loops, args.silent)
         for name, value in report(args.recording, heard, args.rate, args.loops).items():
             print(f"{name:32} {value:.4g}")

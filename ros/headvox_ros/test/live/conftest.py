@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,9 +36,10 @@ WAIT_S = 60.0  # far more than it takes: machines that test are busy
 class Process:
     """A node of the package, in a process of its own."""
 
-    def __init__(self, module: str, *parameters: str, **environment: str) -> None:
-        arguments = [part for parameter in parameters for part in ("-p", parameter)]
-        command = [sys.executable, "-m", f"headvox_ros.{module}", "--ros-args", *arguments]
+    def __init__(self, module: str, *parameters: str, words: Sequence[str] = (), **environment: str) -> None:
+        command = [sys.executable, "-m", f"headvox_ros.{module}", *words]
+        if parameters:
+            command += ["--ros-args", *(part for parameter in parameters for part in ("-p", parameter))]
         self.process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
@@ -217,8 +219,8 @@ def start():
     """Return a function that starts a node; whatever still runs at the end is killed."""
     started: list[Process] = []
 
-    def start(module: str, *parameters: str, **environment: str) -> Process:
-        started.append(Process(module, *parameters, **environment))
+    def start(module: str, *parameters: str, words: Sequence[str] = (), **environment: str) -> Process:
+        started.append(Process(module, *parameters, words=words, **environment))
         return started[-1]
 
     yield start

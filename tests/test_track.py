@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,11 @@ import scenes
 from headvox.config import TrackerConfig
 from headvox.data import Cloud, DepthImage, Frame, Heads, Intrinsics, State, Tracks
 from headvox.errors import HeadvoxError
+from headvox.pipeline import Detector
+from headvox.sources import open_source
 from headvox.track import Tracker, measurement_noise
 
+FILINHA = Path(__file__).parents[1].parent / "shared" / "data" / "recordings" / "filinha"
 MS = 1_000_000
 RATE_MS = 100
 
@@ -352,6 +356,41 @@ def test_what_is_expected_is_where_confirmed_heads_will_be() -> None:
     np.testing.assert_allclose(expected.centres, [walk(1, 22)[0]], atol=0.02)
     assert 0.1 < expected.reaches_m[0] <= 0.4
     assert len(tracker.expected(at(3).stamp_ns)) == 0  # a late frame is not tracked
+
+
+def test_expected_orientations_are_the_same_where_rounding_errors_differ() -> None:
+    """A fit that starts from one would make more of them, and so on from frame to frame."""
+    expected = []
+    for error in (0.0, 1e-13):
+        tracker = Tracker()
+        for k in range(10):
+            yaw = 0.3 + 0.01 * k + error
+            head = replace(heads(STANDING[0]), quaternions=np.array([[0, 0, np.sin(yaw), np.cos(yaw)]]))
+            tracker.update(head, at(k))
+        expected.append(tracker.expected(at(10).stamp_ns).quaternions)
+    np.testing.assert_array_equal(*expected)
+    assert np.linalg.norm(expected[0]) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.skipif(not FILINHA.is_dir(), reason="no shared/data beside the checkout")
+def test_a_camera_pose_that_differs_by_a_rounding_error_gives_the_same_tracks() -> None:
+    """As the same recording does that comes from a bag, where poses are quaternions."""
+    frames = list(open_source(FILINHA))
+    error = np.zeros((4, 4))
+    error[:3, :3] = np.random.default_rng(0).uniform(-2e-16, 2e-16, (3, 3))
+    followed = []
+    for change in (0.0, error):
+        detector, tracker, tracks = Detector(), Tracker(), []
+        for frame in frames:
+            images = [replace(image, T_world_camera=image.T_world_camera + change) for image in frame.depths]
+            changed = replace(frame, depths=tuple(images))
+            heads = detector.detect_frame(changed, tracker.expected(frame.stamp_ns))
+            tracks.append(tracker.update(heads, changed))
+        followed.append(tracks)
+    assert sum(len(tracks) for tracks in followed[0]) > 100
+    for one, other in zip(*followed, strict=True):
+        np.testing.assert_array_equal(one.ids, other.ids)
+        np.testing.assert_allclose(one.centres, other.centres, atol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------------ lost and found

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.metadata import metadata
 
 import pytest
 
@@ -55,3 +56,8 @@ def test_looking_for_it_imports_nothing_heavy() -> None:
     script += "print(*{'numba', 'rerun', 'rclpy', 'pyrealsense2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_every_extra_for_users_is_looked_for() -> None:
+    extras = set(metadata("headvox").get_all("Provides-Extra") or [])
+    assert set(doctor.EXTRAS) == extras - {"dev", "synth"}

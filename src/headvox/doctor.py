@@ -29,6 +29,10 @@ EXTRAS = {
     "bag": ("rosbags", "mcap"),
     "eval": ("motmetrics",),
     "evolve": ("lightgbm", "cmaes"),
+    "cluster": ("distributed", "fsspec"),
+    "realsense": ("pyrealsense2",),
+    "cuda": ("numba_cuda",),
+    "completion": ("shtab",),
 }
 SHORT_S, LONG_S = 10, 240  # compiling everything takes a minute or two on a slow machine
 WITHIN_M = 0.10

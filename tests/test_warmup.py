@@ -9,7 +9,7 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from headvox.config import DetectorConfig
-from headvox.data import Cloud, DepthImage, Frame, Intrinsics
+from headvox.data import Cloud, DepthImage, Expected, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.masks import shipped_cascades
 from headvox.pipeline import Detector
@@ -54,7 +54,9 @@ def test_no_frame_compiles_anything_after_a_warm_up(cascade: str, threads: int) 
     before = compiled()
     detector = Detector(config)
     for frame in frames():
-        detector.detect_frame(frame)
+        heads = detector.detect_frame(frame)
+        reach = np.full(len(heads), 0.2)
+        detector.detect_frame(frame, Expected(heads.centres, heads.quaternions, reach))
     detector.close()
     assert compiled() == before
     assert sum(before.values()) > 10

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from headvox.config import DetectorConfig
-from headvox.data import Cloud, DepthImage, Frame, Heads, Intrinsics
+from headvox.data import Cloud, DepthImage, Expected, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
 from headvox.masks import CompiledCascade, CompiledStages, load_cascade
 from headvox.pipeline import Detector
@@ -37,8 +37,15 @@ def warm_up(config: DetectorConfig) -> None:
         detector.detect_frame(Frame(0, clouds=(Cloud("warm-up", points),)))
         frame = Frame(0, depths=(DepthImage("warm-up", wall, camera, np.eye(4)),))
         detector.detect_frame(frame)
+        detector.detect_frame(frame, _expected())
         _follow(frame)
     detector.close()
+
+
+def _expected() -> Expected:
+    """Return a head that is expected, and one whose orientation nobody knows."""
+    turns = np.array([[0.0, 0.0, 0.0, 1.0], [np.nan, np.nan, np.nan, np.nan]])
+    return Expected(np.zeros((2, 3)), turns, np.full(2, 0.3))
 
 
 def _follow(frame: Frame) -> None:

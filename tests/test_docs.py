@@ -42,6 +42,8 @@ NOT_RUN_HERE = {
     "headvox masks evolve": "takes a night; a small search runs in test_evolve.py",
     "headvox bench": "takes minutes; a quick one runs in test_bench.py",
     "headvox synth two-cameras --people 1": "a longer one of what README makes",
+    "headvox run s3://": "needs a cluster and a bucket; test_workers.py has small ones of both",
+    "dask ": "needs a cluster",
     "headvox eval recording --heads pcl.jsonl": "needs PCL",
     "python bench/": "takes minutes, or needs PCL",
     "pip install": "done already",
@@ -178,6 +180,14 @@ def test_every_piece_of_python_runs(
         exec(compile(piece, "README.md", "exec"), names)
         assert capsys.readouterr().out.strip()
     assert len(names["heads"]) == len(names["heads"].centres)
+
+
+def test_python_that_needs_a_cluster_is_python() -> None:
+    pieces = [piece for document in DOCUMENTS for piece in blocks(document, "py")]
+    assert len(pieces) == 2
+    for piece in pieces:
+        print(f"not run: {piece.splitlines()[0]}: needs a cluster")
+        compile(piece, "scale.md", "exec")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)

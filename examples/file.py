@@ -1,0 +1,34 @@
+"""Print the heads in a file or a folder: a depth recording, a bag, a point cloud, or a folder of clouds.
+
+python examples/file.py [SOURCE]      (without SOURCE: the sample that ships with headvox)
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import headvox
+
+
+def main(place: str | Path) -> None:
+    """Print a line for each head that is followed, frame by frame."""
+    detector, tracker = headvox.Detector(), headvox.Tracker()
+    with closing(headvox.open_source(place)) as source, closing(detector):
+        for frame in source:
+            if isinstance(frame, headvox.BadFrame):
+                print(f"skipped: {frame.reason}", file=sys.stderr)
+                continue
+            heads = detector.detect_frame(frame, tracker.expected(frame.stamp_ns))
+            for track in tracker.update(heads, frame):
+                if track.id:  # 0 until it was seen in three frames of five
+                    x, y, z = track.centre
+                    print(f"{frame.stamp_ns / 1e9:.3f} s  head {track.id}  {x:+.3f} {y:+.3f} {z:+.3f} m")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1] if len(sys.argv) > 1 else headvox.sample_folder())
+    except headvox.HeadvoxError as error:
+        sys.exit(str(error))

@@ -18,8 +18,8 @@ import numpy as np
 
 import headvox
 from headvox.data import Frame
-from headvox.flags import sample_folder
 from headvox.run import look
+from headvox.sample import sample_folder
 from headvox.track import Tracker
 from headvox.view.watch import Watch
 from headvox.warmup import warm_up

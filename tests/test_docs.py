@@ -255,6 +255,15 @@ def test_the_numbers_are_those_of_the_code() -> None:
     assert f"{-low:g} m below and {high:g} m above z = 0, within {far:g} m" in readme
 
 
+def test_the_figures_on_the_first_screen_are_those_of_the_documents() -> None:
+    table = (ROOT / "README.md").read_text("utf-8").split("| default cascade | |")[1].split("\n\n")[0]
+    known = "".join((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("speed", "accuracy"))
+    known = " ".join(known.split())
+    told = re.findall(r"[\d.]+ (?:ms|cm|mm|%|of \d+)|[\d.]+°|\d+,\d+", table)
+    assert len(told) > 10
+    assert not [figure for figure in told if figure not in known]
+
+
 def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs" / "pictures").iterdir())
     assert {"sample.gif", "cascade-default.png", "cascade-paper.png"} <= {path.name for path in pictures}

@@ -29,6 +29,7 @@ setup(
             f"head_detector = {NAME}.head_detector:main",
             f"cloud_concatenate = {NAME}.cloud_concatenate:main",
             f"play_recording = {NAME}.play_recording:main",
+            f"simulate_cameras = {NAME}.simulate_cameras:main",
             f"scenario = {NAME}.scenario:main",
             f"endurance = {NAME}.endurance:main",
         ]

@@ -1,53 +1,27 @@
 """The node ``play_recording``: a depth recording as if its cameras were here.
 
-Each camera NAME publishes as a RealSense driver does: ``/NAME/depth/image_rect_raw``, ``/NAME/depth/camera_info``,
-with ``clouds`` also ``/NAME/depth/points``, its place on /tf_static, and /clock if asked. What the recording knows of
-the true heads goes out on ``/true_heads``.
+It publishes as :mod:`headvox_ros.cameras` says; what the recording knows of the true heads goes out on ``/true_heads``.
 """
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Container, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import rclpy
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, TransformStamped, Vector3
-from rcl_interfaces.msg import ParameterDescriptor
+from geometry_msgs.msg import Point, Pose, Quaternion
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.signals import SignalHandlerOptions
-from rosgraph_msgs.msg import Clock
-from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from std_msgs.msg import Header
-from tf2_msgs.msg import TFMessage
 
-from headvox.data import F32, DepthImage, Frame
+from headvox.data import Frame
 from headvox.errors import HeadvoxError
 from headvox.evaluate.truth import FILE as TRUTH
 from headvox.evaluate.truth import read_truth
 from headvox.ros.synchronise import NS
 from headvox.sources import open_source
-from headvox_ros.cloud_concatenate import as_message_data, cloud_message
-from headvox_ros.sensors import RELIABILITIES
-
-WORLD = "world"
-
-
-@dataclass(frozen=True, slots=True)
-class Camera:
-    """Where one camera publishes."""
-
-    depth: Any
-    info: Any
-    points: Any
+from headvox_ros import processes
+from headvox_ros.cameras import Cameras, fixed
 
 
 class Player(Node):
@@ -55,21 +29,18 @@ class Player(Node):
 
     def __init__(self) -> None:
         super().__init__("play_recording")
-        self.path = self._parameter("recording", "", "Folder of a depth recording.")
-        self.rate_hz = self._parameter("rate_hz", 0.0, "Frames a second; 0 as recorded.")
-        self.loops = self._parameter("loops", 0, "How often to play; 0 for ever.")
-        self.depths = self._parameter("depths", True, "Publish depth images.")
-        self.clouds = self._parameter("clouds", False, "Publish point clouds.")
-        self.clock = self._parameter("clock", False, "Publish /clock, and stamp in the recording's own time.")
-        self.rewind = self._parameter("rewind", False, "With clock: let time jump back at each new loop.")
-        self.delay_s = self._parameter("delay_s", 1.0, "How long to wait for others before the first frame.")
-        reliability = self._parameter(
-            "reliability", "reliable", "best_effort or reliable; drivers offer this."
+        self.path = fixed(self, "recording", "", "Folder of a depth recording.")
+        self.rate_hz = fixed(self, "rate_hz", 0.0, "Frames a second; 0 as recorded.")
+        self.loops = fixed(self, "loops", 0, "How often to play; 0 for ever.")
+        self.depths = fixed(self, "depths", True, "Publish depth images.")
+        self.clouds = fixed(self, "clouds", False, "Publish point clouds.")
+        self.clock = fixed(self, "clock", False, "Publish /clock, and stamp in the recording's own time.")
+        self.rewind = fixed(self, "rewind", False, "With clock: let time jump back at each new loop.")
+        self.delay_s = fixed(self, "delay_s", 1.0, "How long to wait for others before the first frame.")
+        reliability = fixed(self, "reliability", "reliable", "best_effort or reliable; drivers offer this.")
+        self.silent = fixed(
+            self, "silent", [""], "Cameras that stop: NAME:FROM:TO in seconds from the first frame."
         )
-        self.silent = self._parameter(
-            "silent", [""], "Cameras that stop: NAME:FROM:TO in seconds from the first frame."
-        )
-        self._qos = QoSProfile(depth=2, reliability=RELIABILITIES[reliability])
         if not self.path:
             raise HeadvoxError("There is no recording to play.", "Set it: -p recording:=FOLDER")
         frames = [frame for frame in open_source(self.path) if isinstance(frame, Frame)]
@@ -77,29 +48,8 @@ class Player(Node):
             raise HeadvoxError(f"{self.path} has no depth images.", "Is it a depth recording?")
         self.frames = frames
         self._truth = _true_heads(Path(self.path))
-        self._cameras = {image.name: self._camera(image.name) for frame in frames for image in frame.depths}
-        self._clock_out = self.create_publisher(Clock, "/clock", 10) if self.clock else None
-        self._truth_out = self.create_publisher(PoseArray, "/true_heads", 10)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._tf = self.create_publisher(TFMessage, "/tf_static", latched)
-        self._tf.publish(TFMessage(transforms=[_place(image) for image in self._first_images()]))
-
-    def _parameter(self, name: str, default: Any, description: str) -> Any:
-        return self.declare_parameter(
-            name, default, ParameterDescriptor(description=description, read_only=True)
-        ).value
-
-    def _camera(self, name: str) -> Camera:
-        base = f"/{name}/depth"
-        return Camera(
-            self.create_publisher(Image, f"{base}/image_rect_raw", self._qos) if self.depths else None,
-            self.create_publisher(CameraInfo, f"{base}/camera_info", self._qos),
-            self.create_publisher(PointCloud2, f"{base}/points", self._qos) if self.clouds else None,
-        )
-
-    def _first_images(self) -> list[DepthImage]:
-        images = {image.name: image for frame in reversed(self.frames) for image in frame.depths}
-        return [images[name] for name in sorted(images)]
+        images = {image.name: image for frame in reversed(frames) for image in frame.depths}
+        self._cameras = Cameras(self, images.values(), self.depths, self.clouds, self.clock, reliability)
 
     def play(self) -> None:
         """Publish every frame at its time."""
@@ -141,93 +91,15 @@ class Player(Node):
 
     def publish(self, frame: Frame, stamp_ns: int, missing: Container[str] = ()) -> None:
         """Publish what the cameras see in a frame, but those that are ``missing``, with a stamp."""
-        stamp = Time(sec=stamp_ns // NS, nanosec=stamp_ns % NS)
-        if self._clock_out is not None:
-            self._clock_out.publish(Clock(clock=stamp))
-        for image in frame.depths:
-            if image.name in missing:
-                continue
-            camera, header = (
-                self._cameras[image.name],
-                Header(stamp=stamp, frame_id=optical_frame(image.name)),
-            )
-            camera.info.publish(camera_info(header, image))
-            if camera.depth is not None:
-                camera.depth.publish(depth_message(header, image))
-            if camera.points is not None:
-                camera.points.publish(cloud_message(header, organised_points(image)))
-        heads = self._truth.get(frame.stamp_ns)
-        if heads is not None:
-            self._truth_out.publish(PoseArray(header=Header(stamp=stamp, frame_id=WORLD), poses=heads))
+        self._cameras.publish(frame, stamp_ns, missing, self._truth.get(frame.stamp_ns))
 
     def _silence(self, text: str) -> tuple[str, float, float]:
         name, begin, end = text.split(":")
-        if name not in self._cameras:
+        if name not in self._cameras.names:
             raise HeadvoxError(
-                f"silent: there is no camera {name!r}.", f"There is {', '.join(self._cameras)}."
+                f"silent: there is no camera {name!r}.", f"There is {', '.join(self._cameras.names)}."
             )
         return name, float(begin), float(end)
-
-
-def optical_frame(camera: str) -> str:
-    """Return the frame of a camera's depth images, as the RealSense driver names it."""
-    return f"{camera}_depth_optical_frame"
-
-
-def depth_message(header: Header, image: DepthImage) -> Image:
-    """Return a depth image as a driver sends it: 16UC1, millimetres."""
-    height, width = image.depth.shape
-    scale = image.intrinsics.depth_scale
-    depth = image.depth if scale == 0.001 else np.rint(image.depth * (1e3 * scale)).astype(np.uint16)
-    return Image(
-        header=header,
-        height=height,
-        width=width,
-        encoding="16UC1",
-        is_bigendian=int(sys.byteorder == "big"),
-        step=2 * width,
-        data=as_message_data(depth),
-    )
-
-
-def camera_info(header: Header, image: DepthImage) -> CameraInfo:
-    """Return the CameraInfo of a depth image without distortion."""
-    lens = image.intrinsics
-    fx, fy, cx, cy = lens.fx, lens.fy, lens.cx, lens.cy
-    return CameraInfo(
-        header=header,
-        width=lens.width,
-        height=lens.height,
-        distortion_model="plumb_bob",
-        d=[0.0] * 5,
-        k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-    )
-
-
-def organised_points(image: DepthImage) -> F32:
-    """Return the points of an image in its camera's frame, (height, width, 3) float32, NaN where there is no return."""
-    lens = image.intrinsics
-    z = image.depth * np.float32(lens.depth_scale)
-    z[image.depth == 0] = np.nan
-    points = np.empty((*z.shape, 3), np.float32)
-    points[..., 0] = z * (
-        (np.arange(lens.width, dtype=np.float32) - np.float32(lens.cx)) / np.float32(lens.fx)
-    )
-    rows = (np.arange(lens.height, dtype=np.float32) - np.float32(lens.cy)) / np.float32(lens.fy)
-    points[..., 1] = z * rows[:, None]
-    points[..., 2] = z
-    return points
-
-
-def _place(image: DepthImage) -> TransformStamped:
-    x, y, z, w = Rotation.from_matrix(image.T_world_camera[:3, :3]).as_quat().tolist()
-    transform = TransformStamped(header=Header(frame_id=WORLD), child_frame_id=optical_frame(image.name))
-    tx, ty, tz = image.T_world_camera[:3, 3].tolist()
-    transform.transform.translation = Vector3(x=tx, y=ty, z=tz)
-    transform.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
-    return transform
 
 
 def _true_heads(folder: Path) -> dict[int, list[Pose]]:
@@ -250,8 +122,7 @@ def _true_heads(folder: Path) -> dict[int, list[Pose]]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; return its exit code."""
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    processes.init(arguments)
     try:
         Player().play()
     except HeadvoxError as error:

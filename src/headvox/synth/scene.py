@@ -103,10 +103,14 @@ class Scene:
 
     def views(self, stamp_ns: int) -> list[View]:
         """What the cameras would see without any imperfection."""
-        things = [self._person(actor, stamp_ns).mesh for actor in self.actors]
-        things += [_dummy(dummy, DUMMY_IDS_FROM + k).mesh for k, dummy in enumerate(self.room.dummies)]
-        mesh = join([self._still(), *things])
+        mesh = join(self.meshes(stamp_ns))
         return [look(mesh, camera.intrinsics, camera.T_world_camera) for camera in self.cameras]
+
+    def meshes(self, stamp_ns: int) -> list[Mesh]:
+        """The triangles at a time: of the room, of each person, of each dummy. Only people's vertices ever move."""
+        people = [self._person(actor, stamp_ns).mesh for actor in self.actors]
+        dummies = [_dummy(dummy, DUMMY_IDS_FROM + k).mesh for k, dummy in enumerate(self.room.dummies)]
+        return [self._still(), *people, *dummies]
 
     def __getstate__(self) -> dict[str, Any]:
         """Let a scene go to other processes: a module of people goes by its name."""

@@ -1,0 +1,75 @@
+"""Two processes: MuJoCo renders what two cameras see of somebody who walks, and the node finds the head in it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import NS, START_S, stamp_of, xyz
+from geometry_msgs.msg import PoseArray
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from headvox.errors import HeadvoxError
+from headvox.synth.presets import two_cameras
+from headvox.synth.simulator import Simulator
+
+ANSWERS = 12
+
+
+@pytest.fixture(scope="module")
+def simulated(robot, start):
+    """What is to be heard of the simulated cameras, and of a node that takes their depth images."""
+    try:
+        Simulator(two_cameras(duration_s=0.1, mode="d435i-small")).close()
+    except HeadvoxError as error:
+        pytest.skip(str(error))
+    for kind, topic in (
+        (PoseArray, "/true_heads"), (Clock, "/clock"), (Image, "/left/depth/image_rect_raw"),
+        (CameraInfo, "/right/depth/camera_info"), (PointCloud2, "/left/depth/points"),
+    ):  # fmt: skip
+        robot.listen(kind, topic)
+    node = start(
+        "head_detector", "depths:=['/left/depth/image_rect_raw','/right/depth/image_rect_raw']",
+        "target_frame:=world", "use_sim_time:=true", "sync_wait_s:=1.0", "reliability:=reliable",
+    )  # fmt: skip
+    robot.wait(lambda: robot.node.count_subscribers("/left/depth/image_rect_raw") > 0, START_S)
+    cameras = start(
+        "simulate_cameras", "mode:=d435i-small", "clouds:=true", "clock:=true", "rate_hz:=4.0", "walk_s:=20.0"
+    )
+    robot.wait(lambda: len(robot.poses()) >= ANSWERS, START_S)
+    for process in (cameras, node):
+        code, said = process.end()
+        assert code == 0, said
+        assert "Traceback" not in said, said
+    return robot.got
+
+
+def test_the_head_is_found_where_it_truly_is(simulated):
+    true = {stamp_of(message): xyz(message.poses[0]) for message in simulated["/true_heads"]}
+    errors = []
+    for message in simulated["/head_detector/poses"]:
+        assert message.header.frame_id == "world"
+        centres = np.array([xyz(pose) for pose in message.poses]).reshape(-1, 3)
+        errors.append(np.linalg.norm(centres - true[stamp_of(message)], axis=1).min(initial=9.0))
+    errors = np.array(errors)
+    print(f"\n{len(errors)} answers, centre error {100 * np.median(errors):.2f} cm in the median")
+    assert np.mean(errors < 0.15) > 0.9
+    assert np.median(errors) < 0.03
+
+
+def test_the_person_walks(simulated):
+    places = np.array([xyz(message.poses[0]) for message in simulated["/true_heads"]])
+    assert np.ptp(places[:, :2], axis=0).max() > 0.1
+
+
+def test_all_that_a_driver_publishes_is_there_with_the_time_of_the_simulation(simulated):
+    times = {message.clock.sec * NS + message.clock.nanosec for message in simulated["/clock"]}
+    for topic, frame in (
+        ("/left/depth/image_rect_raw", "left_depth_optical_frame"),
+        ("/right/depth/camera_info", "right_depth_optical_frame"),
+        ("/left/depth/points", "left_depth_optical_frame"),
+    ):
+        messages = simulated[topic]
+        assert len(messages) > 3
+        assert {message.header.frame_id for message in messages} == {frame}
+        assert {stamp_of(message) for message in messages} <= times

@@ -79,6 +79,13 @@ def test_detections_without_a_track_say_nothing_of_identity() -> None:
     assert s.idf1 == pytest.approx(2 * 1 / (3 + 1))
 
 
+def test_a_detection_without_a_track_takes_no_head_from_a_track_and_is_no_false_track() -> None:
+    seen, gone = frame({1: False}, {7: 0.05, NO_ID: 0.0}), frame({1: True}, {})
+    s = tracked(seen, gone, seen)
+    assert (s.mota, s.idf1) == (1.0, 1.0)
+    assert (s.gaps, s.bridged) == (1, 1)
+
+
 def test_without_ids_there_are_no_figures() -> None:
     assert score_tracks([frame(BOTH, {NO_ID: 0.0})], Rules()) is None
     anyone = frame({1: False}, {7: 0.0})

@@ -31,6 +31,10 @@ class Tracks:
 class TrackingScores:
     """Figures of identity; the shares are 0..1, ``mota`` may be below 0.
 
+    They are of what has an id. A head that was found without one (a tentative track) is nobody's: whoever has no more
+    than that is missed, and a false one is no false track. Recall and false heads, which count all that was found, are
+    in :mod:`headvox.evaluate.metrics`.
+
     ``gaps`` are the times that a head was hidden (labelled as ignored) and had a track before; ``bridged`` are those
     after which it had the same track again; ``coasted`` is the share of the frames in between in which that track
     was stated within the radius of the hidden head.
@@ -164,9 +168,7 @@ def coasting(samples: Sequence[Sample], rules: Rules) -> tuple[int, int, float |
 
 def _pairs_by_id(sample: Sample, rules: Rules) -> dict[int, int]:
     assert sample.true is not None
-    paired: Match = match(sample.found.centres, sample.true.centres, counted(sample.true, rules), rules)
-    return {
-        int(sample.true.ids[j]): int(sample.found.ids[i])
-        for i, j in paired.pairs
-        if sample.true.ids[j] != NO_ID
-    }
+    true, found = sample.true, sample.found
+    named = np.nonzero(found.ids != NO_ID)[0]
+    paired: Match = match(found.centres[named], true.centres, counted(true, rules), rules)
+    return {int(true.ids[j]): int(found.ids[named[i]]) for i, j in paired.pairs if true.ids[j] != NO_ID}

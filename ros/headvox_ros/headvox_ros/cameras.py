@@ -25,6 +25,7 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from headvox.data import F32, DepthImage, Frame
+from headvox.errors import HeadvoxError
 from headvox.ros.synchronise import NS
 from headvox_ros.cloud_concatenate import as_message_data, cloud_message
 from headvox_ros.sensors import RELIABILITIES
@@ -42,7 +43,11 @@ class Camera:
 
 
 class Cameras:
-    """Publishes for cameras that are placed as in ``images``, one of each, through a node."""
+    """Publishes for cameras that are placed as in ``images``, one of each, through a node.
+
+    Raises:
+        HeadvoxError: a ``reliability`` that is none.
+    """
 
     def __init__(
         self,
@@ -53,6 +58,10 @@ class Cameras:
         clock: bool,
         reliability: str,
     ) -> None:
+        if reliability not in RELIABILITIES:
+            raise HeadvoxError(
+                f"reliability: expected {' or '.join(RELIABILITIES)}, got {reliability!r}.", ""
+            )
         images = list(images)
         qos = QoSProfile(depth=2, reliability=RELIABILITIES[reliability])
         self._cameras = {image.name: _camera(node, image.name, depths, clouds, qos) for image in images}

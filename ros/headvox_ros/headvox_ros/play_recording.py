@@ -94,12 +94,16 @@ class Player(Node):
         self._cameras.publish(frame, stamp_ns, missing, self._truth.get(frame.stamp_ns))
 
     def _silence(self, text: str) -> tuple[str, float, float]:
-        name, begin, end = text.split(":")
+        try:
+            name, begin, end = text.split(":")
+            times = float(begin), float(end)
+        except ValueError:
+            raise HeadvoxError(f"silent: expected NAME:FROM:TO in seconds, got {text!r}.", "") from None
         if name not in self._cameras.names:
             raise HeadvoxError(
                 f"silent: there is no camera {name!r}.", f"There is {', '.join(self._cameras.names)}."
             )
-        return name, float(begin), float(end)
+        return (name, *times)
 
 
 def _true_heads(folder: Path) -> dict[int, list[Pose]]:

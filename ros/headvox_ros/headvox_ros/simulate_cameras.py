@@ -40,6 +40,8 @@ class Simulation(Node):
         reliability = fixed(self, "reliability", "reliable", "best_effort or reliable; drivers offer this.")
         if not (self.walk_s > 0.0 and self.rate_hz > 0.0):
             raise HeadvoxError("walk_s and rate_hz: expected more than 0.", "")
+        if seed < 0:
+            raise HeadvoxError(f"seed: expected 0 or more, got {seed}.", "")
         self.scene = two_cameras(seed, duration_s=self.walk_s, mode=mode, sensor=IDEAL)
         self.simulator = Simulator(self.scene)
         images = self.simulator.frame(0).depths

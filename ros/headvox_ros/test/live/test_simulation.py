@@ -73,3 +73,22 @@ def test_all_that_a_driver_publishes_is_there_with_the_time_of_the_simulation(si
         assert len(messages) > 3
         assert {message.header.frame_id for message in messages} == {frame}
         assert {stamp_of(message) for message in messages} <= times
+
+
+@pytest.mark.parametrize(
+    ("module", "parameter", "said"),
+    [
+        ("simulate_cameras", "mode:=nonsense", "Expected a lens"),
+        ("simulate_cameras", "rate_hz:=0.0", "expected more than 0"),
+        ("simulate_cameras", "seed:=-1", "seed: expected 0 or more, got -1"),
+        ("play_recording", "reliability:=maybe", "expected best_effort or reliable, got 'maybe'"),
+        ("play_recording", "silent:=['left:now']", "expected NAME:FROM:TO in seconds, got 'left:now'"),
+        ("play_recording", "silent:=['up:0:1']", "There is left, right"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused_with_a_reason(start, sample, module, parameter, said):
+    recording = [f"recording:={sample}"] if module == "play_recording" else []
+    code, output = start(module, *recording, parameter).wait()
+    assert code == 1
+    assert said in output
+    assert "Traceback" not in output

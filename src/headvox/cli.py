@@ -64,6 +64,8 @@ examples:
   headvox run cloud.ply                        the heads in one cloud
   headvox run recording/ --json                one JSON object a frame
   headvox run recording/ -o heads.csv          one row a head
+  headvox view recording/                      the run in rerun's viewer; render makes a film of it
+  headvox align recording/ -o extrinsics.toml  where the cameras stand
   headvox config --max-range 4 > my.toml       settings to keep, for --config my.toml
   headvox synth two-cameras -o rig             a recording of synthetic people, with their true heads
   headvox eval rig                             how many of them are found, and how well

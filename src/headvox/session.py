@@ -58,7 +58,7 @@ class Session:
             if on_result is not None:
                 on_result(frame, result)
 
-        self.live.show("getting ready (the first time compiles, ten seconds or more)")
+        self.live.show("getting ready (the first time compiles, for half a minute or so)")
         warm_up(self.config)
         report = run(
             self.source,

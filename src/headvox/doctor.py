@@ -33,6 +33,7 @@ EXTRAS = {
     "realsense": ("pyrealsense2",),
     "cuda": ("numba_cuda",),
     "completion": ("shtab",),
+    "sim": ("mujoco",),
 }
 SHORT_S, LONG_S = 10, 240  # compiling everything takes a minute or two on a slow machine
 WITHIN_M = 0.10

@@ -204,6 +204,7 @@ def _check_type(key: str, value: object) -> None:
 
 
 def _is_number(value: object, most: float) -> bool:
+    # The type checker knows no order of numbers.Real, which NumPy's scalars are, too.
     return not isinstance(value, bool) and isinstance(value, Real) and -most <= value <= most  # type: ignore[operator]
 
 

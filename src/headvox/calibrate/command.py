@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from headvox.atomic import write_text
 from headvox.errors import HeadvoxError
 from headvox.flags import GOOD, add_source_options, keep_input, place, source_options_of, whole_number
 from headvox.live import Live
@@ -59,7 +60,7 @@ def main(argv: Sequence[str]) -> int:
     _tell(views, placed, found)
     if args.output is not None:
         keep_input(args.output, [args.source])
-        args.output.write_text(extrinsics_text(found), encoding="utf-8")
+        write_text(args.output, extrinsics_text(found))
         print(f"\nwritten to {printable(str(args.output))}")
     return GOOD
 

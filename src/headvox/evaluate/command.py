@@ -21,6 +21,7 @@ from headvox.flags import (
     add_settings,
     config_of,
     number,
+    seed_number,
     tracker_config_of,
     whole_number,
 )
@@ -317,7 +318,7 @@ def _parser() -> argparse.ArgumentParser:
         "--revolutions", type=length, default=1.0, metavar="R", help="rotation: how many turns (1)"
     )
     scenes.add_argument(
-        "--seed", type=not_negative, default=0, metavar="N", help="another number, other heads and people (0)"
+        "--seed", type=seed_number, default=0, metavar="N", help="another number, other heads and people (0)"
     )
     add_flags(parser)
     add_settings(parser)
@@ -332,14 +333,6 @@ def limit(text: str) -> Limit:
         return Limit.parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def not_negative(text: str) -> int:
-    """Read a whole number from 0 on, for argparse."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"expected at least 0, got {text!r}")
-    return value
 
 
 def length(text: str) -> float:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from headvox.atomic import write_text
 from headvox.errors import HeadvoxError
 from headvox.evaluate.metrics import Group
 from headvox.evaluate.scores import LESS, MORE, Scores
@@ -32,9 +32,7 @@ class Report:
 
     def save(self, path: Path) -> None:
         """Write the report as JSON; what stood there stays until the new one is complete."""
-        unfinished = path.with_name(path.name + ".part")
-        unfinished.write_text(self.to_json() + "\n", encoding="utf-8")
-        os.replace(unfinished, path)
+        write_text(path, self.to_json() + "\n")
 
     @staticmethod
     def load(path: Path) -> Report:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from headvox.atomic import write_text
 from headvox.evolve.bank import OCCUPIED, SEEN, SUBDIVISION, VOXEL_M
 from headvox.evolve.boost import Fitted
 from headvox.masks import Condition, Group
@@ -37,9 +37,7 @@ class Found:
 
 def write_cascade(path: Path, name: str, found: Found) -> None:
     """Write the cascade, at once and whole."""
-    part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_text(cascade_text(name, found), encoding="utf-8")
-    os.replace(part, path)
+    write_text(path, cascade_text(name, found))
 
 
 def cascade_text(name: str, found: Found) -> str:

@@ -21,6 +21,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from headvox import __version__
+from headvox.atomic import write_text
 from headvox.data import U16, Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.sources.folder import FRAME_NS
@@ -111,9 +112,9 @@ def _write(
         lines.append(line)
         if on_done is not None:
             on_done(len(lines))
-    _write_text(partial_folder / "heads.jsonl", "".join(line.read_text(encoding="utf-8") for line in lines))
+    write_text(partial_folder / "heads.jsonl", "".join(line.read_text(encoding="utf-8") for line in lines))
     if description is not None:
-        _write_text(partial_folder / "recording.json", description)
+        write_text(partial_folder / "recording.json", description)
     for line in lines:
         line.unlink()
     truth.rmdir()
@@ -144,7 +145,7 @@ def _begin(folder: Path, making: dict[str, Any]) -> None:
     note = folder / "making.json"
     folder.mkdir(parents=True, exist_ok=True)
     if not note.exists() and not any(folder.iterdir()):
-        _write_text(note, json.dumps(making))
+        write_text(note, json.dumps(making))
     elif not note.exists() or json.loads(note.read_text(encoding="utf-8")) != making:
         raise HeadvoxError(
             f"{folder} holds the beginning of another recording.", "Remove it, or give another name."
@@ -160,7 +161,7 @@ def _make_frame(
         return line
     frame, heads = scene.frame(stamp_ns)
     write_frame(folder, frame, number)
-    _write_text(
+    write_text(
         line, json.dumps({"stamp_ns": stamp_ns, "heads": [_row(h) for h in heads], "exhaustive": True}) + "\n"
     )
     return line
@@ -220,12 +221,6 @@ def _description(scene: Scene, stamps_ns: Sequence[int]) -> dict[str, Any]:
 def _write_png(path: Path, depth: U16) -> None:
     unfinished = path.with_suffix(".part")
     Image.fromarray(depth).save(unfinished, format="PNG", compress_level=6)
-    os.replace(unfinished, path)
-
-
-def _write_text(path: Path, text: str) -> None:
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(text, encoding="utf-8")
     os.replace(unfinished, path)
 
 

@@ -17,12 +17,13 @@ from test_pipeline import NARROW, SMALL, camera_frame, everything, expecting, tw
 
 from headvox import Cloud, DepthImage, Detector, Frame, HeadvoxError, Intrinsics
 from headvox.cli import main
+from headvox.compile_masks import compile_cascade
 from headvox.config import DetectorConfig
 from headvox.cuda import compact, gate, integral, judge, readings, search, suppress, vote, voxelize
 from headvox.cuda.device import BATCH, check_device, is_simulated
 from headvox.gate import gate_tables, pass_gate
 from headvox.integral import integral_volume
-from headvox.masks import compile_cascade, load_cascade, parse_cascade
+from headvox.read_masks import load_cascade, parse_cascade
 from headvox.suppress import suppress as suppress_on_cpu
 from headvox.visibility import cells_of, count_seen
 from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes

@@ -14,9 +14,10 @@ import scenes
 from numba import cuda
 from numba.cuda import dispatcher
 
+from headvox.compile_masks import compile_cascade
 from headvox.data import Cloud, Frame
-from headvox.masks import compile_cascade, load_cascade, parse_cascade
 from headvox.pipeline import AROUND
+from headvox.read_masks import load_cascade, parse_cascade
 from headvox.voxelize import Lattice
 
 KERNELS = 19

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from headvox.cli import main
+from headvox.compile_masks import compile_cascade
 from headvox.data import Cloud, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.evolve import bank, boost, gates, samples, search, views
@@ -18,7 +19,7 @@ from headvox.evolve.check import Outcome, check
 from headvox.evolve.write import Found, cascade_text, write_cascade
 from headvox.frames import inverse, transform
 from headvox.gate import pass_gate
-from headvox.masks import compile_cascade, load_cascade, parse_cascade
+from headvox.read_masks import load_cascade, parse_cascade
 from headvox.synth.scene import TrueHead
 from headvox.vote import DROPPED, score_by_stages
 

@@ -9,19 +9,12 @@ import tomllib
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headvox import masks
+from headvox import read_masks
+from headvox.compile_masks import compile_cascade, voxel_box, voxel_range
 from headvox.errors import HeadvoxError
 from headvox.integral import integral_volume
-from headvox.masks import (
-    Box,
-    compile_cascade,
-    load_cascade,
-    parse_cascade,
-    ring,
-    shipped_cascades,
-    voxel_box,
-    voxel_range,
-)
+from headvox.masks import Box, ring
+from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
 
 VOXELS = [k / 100 for k in range(1, 11)] + [0.025, 0.0125, 1 / 30]
 STAGES, VOTES = tomllib.loads(scenes.STAGES), tomllib.loads(scenes.VOTES)
@@ -337,7 +330,7 @@ def test_a_file_without_end_is_not_read(tmp_path):
 
 def test_numbers_without_end_are_refused_by_the_size_of_the_file(tmp_path):
     path = tmp_path / "long.toml"
-    path.write_bytes(b"x = [" + b"1," * (masks.MAX_FILE_BYTES // 2) + b"1]")
+    path.write_bytes(b"x = [" + b"1," * (read_masks.MAX_FILE_BYTES // 2) + b"1]")
     with pytest.raises(HeadvoxError, match="larger than 8 MiB"):
         load_cascade(path)
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from headvox import cli
 from headvox.describe_masks import describe_cascade
-from headvox.masks import Cascade, load_cascade, parse_cascade, shipped_cascades
+from headvox.masks import Cascade
 from headvox.plot_masks import (
     GREEN,
     RED,
@@ -21,6 +21,7 @@ from headvox.plot_masks import (
     pictures_of,
     plot_cascade,
 )
+from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
 
 pytest.importorskip("matplotlib")
 

@@ -6,8 +6,10 @@ import pytest
 import scenes
 from test_gate import random_cells
 
+from headvox.compile_masks import compile_cascade
 from headvox.integral import integral_volume
-from headvox.masks import Stage, compile_cascade, load_cascade, parse_cascade, shipped_cascades
+from headvox.masks import Stage
+from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
 from headvox.simd import LANES
 from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes, statistics_of
 

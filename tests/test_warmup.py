@@ -11,8 +11,8 @@ from numba.core.dispatcher import Dispatcher
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Intrinsics
 from headvox.errors import HeadvoxError
-from headvox.masks import shipped_cascades
 from headvox.pipeline import Detector
+from headvox.read_masks import shipped_cascades
 from headvox.warmup import cache_folder, warm_up
 
 

@@ -27,12 +27,13 @@ import numpy as np
 from headvox import __version__
 from headvox.bench_input import SHELL_POINTS, Input, describe_machine, load_average, make_input
 from headvox.bench_report import report
+from headvox.compile_masks import compile_cascade
 from headvox.config import DetectorConfig
 from headvox.data import F32, F64, Heads, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.flags import whole_number
-from headvox.masks import compile_cascade, parse_cascade
 from headvox.pipeline import Detector
+from headvox.read_masks import parse_cascade
 from headvox.warmup import warm_up
 
 Values = dict[str, Any]

@@ -266,7 +266,7 @@ def _info(args: argparse.Namespace) -> int:
 
 def _show_config(args: argparse.Namespace) -> int:
     from headvox.config import to_toml
-    from headvox.masks import load_cascade
+    from headvox.read_masks import load_cascade
 
     config = config_of(args)
     load_cascade(config.cascade)  # a wrong name is to be told now, not when the file is used
@@ -279,7 +279,7 @@ def _warmup(args: argparse.Namespace) -> int:
 
     begun = time.perf_counter()
     from headvox.config import DetectorConfig
-    from headvox.masks import shipped_cascades
+    from headvox.read_masks import shipped_cascades
     from headvox.warmup import cache_folder, warm_up
 
     rows = []

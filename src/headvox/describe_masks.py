@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from headvox.masks import Cascade, Condition, Group, Stage, Votes, cuts, volume, voxel_box
+from headvox.compile_masks import volume, voxel_box
+from headvox.masks import Cascade, Condition, Group, Stage, Votes, cuts
 from headvox.table import printable, table
 
 LOOK_UPS_A_BOX = 8

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from headvox.compile_masks import CompiledGate
 from headvox.integral import Integral, box_reach, set_corners, with_margins
 from headvox.kernels import bare_kernel, rule
-from headvox.masks import CompiledGate
 from headvox.simd import LANES, add, fill, less, load, lowest, sub, times, within
 
 SLICES = 4

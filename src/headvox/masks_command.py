@@ -52,7 +52,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _masks_list(args: argparse.Namespace) -> int:
-    from headvox.masks import load_cascade, shipped_cascades
+    from headvox.read_masks import load_cascade, shipped_cascades
 
     cascades = [(name, load_cascade(name)) for name in shipped_cascades()]
     rows = [
@@ -65,15 +65,15 @@ def _masks_list(args: argparse.Namespace) -> int:
 
 def _masks_show(args: argparse.Namespace) -> int:
     from headvox.describe_masks import describe_cascade
-    from headvox.masks import load_cascade
+    from headvox.read_masks import load_cascade
 
     print(describe_cascade(load_cascade(args.cascade)))
     return GOOD
 
 
 def _masks_plot(args: argparse.Namespace) -> int:
-    from headvox.masks import load_cascade
     from headvox.plot_masks import file_name, plot_cascade
+    from headvox.read_masks import load_cascade
 
     cascade = load_cascade(args.cascade)
     folder = args.output or Path(f"masks-{file_name(cascade.name)}")

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.align import Scratch
+from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.cuda.readings import Found
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
 from headvox.integral import box_reach, shape_with_margins
-from headvox.masks import CompiledCascade, CompiledStages
 from headvox.refine import MOST_PARTS
 from headvox.simd import LANES
 from headvox.visibility import cells_of

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.check import check_frame, nothing_in_range, origins_of
+from headvox.compile_masks import SCORE_UNIT, compile_cascade
 from headvox.config import DetectorConfig
 from headvox.cuda.device import BATCH, Device, DeviceLost, use_device
 from headvox.cuda.readings import Asked, Found
@@ -23,9 +24,9 @@ from headvox.fuse import Region
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners, shape_with_margins
 from headvox.kernels import Threads, read_only
-from headvox.masks import SCORE_UNIT, compile_cascade, load_cascade
 from headvox.memory import Memory, Stages
 from headvox.pose import fit_poses
+from headvox.read_masks import load_cascade
 from headvox.refine import HAIR_M, cells_about, fit_spheres
 from headvox.simd import LANES
 from headvox.suppress import PEAK_REACH, local_maxima, suppress_overlaps

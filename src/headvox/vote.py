@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from headvox.compile_masks import SCORE_UNIT, CompiledStages, CompiledVotes
 from headvox.integral import Integral, box_reach, box_sum, set_corners, with_margins
 from headvox.kernels import bare_kernel, kernel, product, rule
-from headvox.masks import SCORE_UNIT, STATISTICS, CompiledStages, CompiledVotes
+from headvox.masks import STATISTICS
 from headvox.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
 
 DROPPED = -(1 << 40)

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
-from headvox.masks import CompiledCascade, CompiledStages, load_cascade
 from headvox.pipeline import Detector
+from headvox.read_masks import load_cascade
 from headvox.track import Tracker
 
 _ANYTHING = 1 << 40

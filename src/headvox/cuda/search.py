@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import cuda
 
+from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.cuda import compact, gate, integral, judge, suppress, vote, voxelize
 from headvox.cuda.lanes import SIMULATED
 from headvox.cuda.readings import Asked, Found, pack, words_of
 from headvox.data import DepthImage
 from headvox.gate import gate_tables
-from headvox.masks import CompiledCascade, CompiledStages
 from headvox.suppress import PEAK_REACH
 from headvox.visibility import cells_of
 from headvox.vote import seen_boxes

@@ -205,7 +205,7 @@ def _made(plan: Plan, args: argparse.Namespace) -> dict[str, Any]:
     import numba
     import numpy
 
-    from headvox.masks import load_cascade
+    from headvox.read_masks import load_cascade
 
     made = {
         "headvox": __version__,

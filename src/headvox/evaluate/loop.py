@@ -17,8 +17,8 @@ from headvox.evaluate.match import Rules, match
 from headvox.evaluate.metrics import Sample, counted
 from headvox.evaluate.scenarios import Scenario
 from headvox.evaluate.truth import NO_ID, Bools, TrueHeads
-from headvox.masks import load_cascade
 from headvox.pipeline import Detector
+from headvox.read_masks import load_cascade
 from headvox.run import look
 from headvox.track import Tracker
 from headvox.warmup import warm_up

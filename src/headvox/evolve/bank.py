@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from headvox.compile_masks import voxel_box
 from headvox.integral import Integral
 from headvox.kernels import kernel
-from headvox.masks import CHANNELS, STATISTICS, Box, Group, ring, statistics, voxel_box
+from headvox.masks import CHANNELS, STATISTICS, Box, Group, ring, statistics
 from headvox.vote import sum_about
 
 VOXEL_M, SUBDIVISION = 0.05, 2

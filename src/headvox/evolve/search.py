@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from headvox.compile_masks import CompiledCascade, CompiledGate, compile_cascade
 from headvox.errors import HeadvoxError
 from headvox.evolve import boost, gates
 from headvox.evolve.bank import SUBDIVISION, VOXEL_M
@@ -32,14 +33,8 @@ from headvox.evolve.samples import (
 )
 from headvox.evolve.views import View, keep_view
 from headvox.evolve.write import Found, cascade_text, write_cascade
-from headvox.masks import (
-    Cascade,
-    CompiledCascade,
-    CompiledGate,
-    Condition,
-    compile_cascade,
-    parse_cascade,
-)
+from headvox.masks import Cascade, Condition
+from headvox.read_masks import parse_cascade
 from headvox.workers import ALONE, Workers
 
 GATE_VIEWS = 3000

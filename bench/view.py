@@ -2,8 +2,9 @@
 
     python bench/view.py [RECORDING] [--hz 30] [--rounds 6] [--show]
 
-The loop runs at a camera's rate. Timed is what the loop does for a frame: find the heads, follow them, hand the frame
-over. Without ``--show`` the frames go into an rrd file, with it to the viewer on the screen.
+The loop runs at a camera's rate, and the frames are stamped so. Timed is what the loop does for a frame: find the
+heads, follow them, hand the frame over. Without ``--show`` the frames go into an rrd file, with it to the viewer on the
+screen.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import tempfile
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from headvox.data import Frame
 from headvox.run import look
 from headvox.sample import sample_folder
 from headvox.track import Tracker
-from headvox.view.watch import Watch
+from headvox.view.watch import SHOWN_HZ, Watch
 from headvox.warmup import warm_up
 
 
@@ -52,6 +54,7 @@ def main() -> None:
     detector = headvox.Detector()
     warm_up(detector.config)
     frames = [frame for frame in headvox.open_source(args.recording) if isinstance(frame, Frame)]
+    frames = [replace(frame, stamp_ns=int(1e9 * k / args.hz)) for k, frame in enumerate(frames)]
     without: list[float] = []
     with_view: list[float] = []
     dropped = 0
@@ -66,12 +69,15 @@ def main() -> None:
                 with_view += times_ms(detector, frames, args.hz, watch)
                 dropped += watch.dropped - before
                 time.sleep(0.5)
-    print(f"{'ms a frame':14}{'p50':>8}{'p99':>8}")
-    for name, took in (("without", without), ("with --view", with_view)):
-        print(f"{name:14}{np.percentile(took, 50):8.2f}{np.percentile(took, 99):8.2f}")
-    cost = [np.percentile(with_view, p) / np.percentile(without, p) - 1.0 for p in (50, 99)]
-    print(f"{'cost':14}{cost[0]:8.1%}{cost[1]:8.1%}")
-    print(f"{len(with_view)} frames at {args.hz:g} Hz, {dropped} of them not shown")
+    bare, shown = ((np.mean(took), *np.percentile(took, (50, 99))) for took in (without, with_view))
+    print(f"{'ms a frame':14}{'mean':>8}{'p50':>8}{'p99':>8}")
+    for name, row in (("without", bare), ("with --view", shown)):
+        print(f"{name:14}" + "".join(f"{ms:8.2f}" for ms in row))
+    print(f"{'cost':14}" + "".join(f"{b / a - 1.0:8.1%}" for a, b in zip(bare, shown, strict=True)))
+    print(
+        f"{len(with_view)} frames at {args.hz:g} Hz, shown {SHOWN_HZ} a second at most; "
+        f"{dropped} more left out because the viewer was busy"
+    )
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from headvox.run import look
 from headvox.sinks import Result
 from headvox.track import Tracker
 from headvox.view.mailbox import Mailbox, letters
+from headvox.view.watch import Watch
 
 SAMPLE = Path(headvox.__file__).parent / "assets" / "sample"
 FRAMES = 6
@@ -150,6 +152,20 @@ def test_with_every_nothing_is_dropped(tmp_path: Path) -> None:
     mailbox.close()
     assert [int(line.split()[0]) for line in out.read_text().splitlines()] == list(range(30))
     assert mailbox.dropped == 0
+
+
+@pytest.mark.parametrize(("hz", "every", "shown"), [(30, False, 10), (30, True, 30), (9, False, 30)])
+def test_ten_frames_a_second_are_shown(found, monkeypatch, tmp_path, hz, every, shown) -> None:
+    left = []
+    monkeypatch.setattr(Mailbox, "put", lambda _, letter: left.append(letter.result.frame))
+    frame, result = found[0]
+    detector = headvox.Detector()
+    watch = Watch(detector, tmp_path / "out.rrd", every)
+    for number in range(30):
+        watch.show(replace(frame, stamp_ns=number * 10**9 // hz), replace(result, frame=number))
+    watch.close()
+    assert len(left) == shown
+    assert left[0] == 0
 
 
 def test_a_child_that_ends_is_told() -> None:

@@ -340,7 +340,7 @@ def _parser() -> argparse.ArgumentParser:
         const=False,
         type=view_command.rrd_file,
         metavar="OUT.rrd",
-        help="show the run in rerun's viewer, or write a file for it; frames are left out, never waited for",
+        help="show the run in rerun's viewer, or write a file for it: ten frames a second at most, never waited for",
     )
     add_settings(run)
     add_tracker_settings(run)

@@ -14,6 +14,9 @@ from headvox.errors import HeadvoxError
 from headvox.sinks import Result
 from headvox.view.mailbox import Mailbox
 
+SHOWN_HZ = 10
+"""How many frames of a second are shown at most, unless all are wanted: what draws them leaves the loop cold caches."""
+
 if TYPE_CHECKING:
     from headvox.pipeline import Detector
 
@@ -32,9 +35,9 @@ class Seen:
 
 
 class Watch:
-    """Shows frames in rerun's viewer, or writes them to an rrd file.
+    """Shows frames in rerun's viewer, or writes them to an rrd file: at most :data:`SHOWN_HZ` a second of their stamps.
 
-    ``dropped`` counts the frames that were not shown because the viewer was busy.
+    ``dropped`` counts those that were not shown because the viewer was busy.
     """
 
     def __init__(self, detector: Detector, path: Path | None = None, every: bool = False) -> None:
@@ -43,13 +46,15 @@ class Watch:
         Args:
             detector: what finds the heads of the frames that are shown.
             path: an rrd file to write; without one the viewer is started, or the one that runs already used.
-            every: show every frame, and wait for the viewer.
+            every: show every frame, whatever their rate, and wait for the viewer.
 
         Raises:
             HeadvoxError: rerun is not installed, there is no display, or the file cannot be made.
         """
         check(path)
         self._detector = detector
+        self._every = every
+        self._slot: int | None = None
         command = ["-m", "headvox.view.log", "every" if every else "newest"]
         self._mailbox = Mailbox([*command, *([] if path is None else [str(path)])], every)
 
@@ -59,7 +64,11 @@ class Watch:
         return self._mailbox.dropped
 
     def show(self, frame: Frame, result: Result) -> None:
-        """Hand over the frame that the detector has just looked at."""
+        """Hand over the frame that the detector has just looked at, unless its share of a second had one already."""
+        slot = frame.stamp_ns * SHOWN_HZ // 10**9
+        if slot == self._slot and not self._every:
+            return
+        self._slot = slot
         candidates, votes = self._detector.candidates_of_last_frame()
         self._mailbox.put(Seen(frame, result, candidates, votes, dict(self._detector.stage_ms)))
 

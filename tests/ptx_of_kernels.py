@@ -16,8 +16,8 @@ from numba.cuda import dispatcher
 
 from headvox.compile_masks import compile_cascade
 from headvox.data import Cloud, Frame
-from headvox.pipeline import AROUND
 from headvox.read_masks import load_cascade, parse_cascade
+from headvox.suppress import AROUND
 from headvox.voxelize import Lattice
 
 KERNELS = 19

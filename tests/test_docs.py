@@ -238,7 +238,7 @@ def test_the_columns_of_a_csv_file_are_told() -> None:
 
 
 def test_the_numbers_are_those_of_the_code() -> None:
-    from headvox import pipeline, refine
+    from headvox import assemble, pipeline, refine
     from headvox.config import DetectorConfig
 
     how = " ".join((ROOT / "docs" / "how-it-works.md").read_text("utf-8").split())
@@ -246,7 +246,7 @@ def test_the_numbers_are_those_of_the_code() -> None:
     for told in (
         f"{100 * refine.HAIR_M:g} cm below",
         f"at most {100 * refine.REACH_M:g} cm",
-        f"closer than {100 * pipeline.SAME_HEAD_M:g} cm",
+        f"closer than {100 * assemble.SAME_HEAD_M:g} cm",
         *(f"| {stage} |" for stage in pipeline.STAGES),
     ):
         assert told in how

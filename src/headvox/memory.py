@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from headvox.align import Scratch
 from headvox.compile_masks import CompiledCascade, CompiledStages
-from headvox.cuda.readings import Found
+from headvox.data import F64
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
 from headvox.integral import box_reach, shape_with_margins
 from headvox.refine import MOST_PARTS
@@ -72,26 +72,14 @@ class Memory:
             self.cells[0][self.dirty[0] : self.dirty[1]] = 0
         self.dirty = None
 
-    def enter_patches(self, found: Found) -> None:
-        """Enter the cells about the peaks that the device found into the grid, for the fit of spheres."""
-        cells, reach = self.cells[0], found.patches.shape[1] // 2
-        has_patch = found.patch_of >= 0
-        patches = found.patches[found.patch_of[has_patch]]
-        for centre, patch in zip(found.cells[has_patch].tolist(), patches, strict=True):
-            low = [max(c - reach, 0) for c in centre]
-            high = [min(c + reach + 1, n) for c, n in zip(centre, cells.shape, strict=True)]
-            inside = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-            from_patch = tuple(
-                slice(a - c + reach, b - c + reach) for a, b, c in zip(low, high, centre, strict=True)
-            )
-            cells[inside] = patch[from_patch]
-            first, after = self.dirty if self.dirty and self.dirty != (0, 0) else (low[0], high[0])
-            self.dirty = (min(first, low[0]), max(after, high[0]))
-
     def candidates_about(self, occupied: I64) -> I64:
         """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""
         box = occupied + self.candidate_reach
         return np.concatenate([np.maximum(box[:3], 0), np.minimum(box[3:], np.array(self.lattice.shape) - 1)])
+
+    def centres(self, cells: I32) -> F64:
+        """Return the world centres (N, 3) of ``cells`` (N, 3) of the integral volume."""
+        return self.lattice.centres(cells + self.first)
 
     def place(self, lattice: Lattice) -> None:
         """Stand for another region of the same shape."""

@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from headvox.assemble import MOST_POSES, heads_at, with_poses
 from headvox.check import check_frame, nothing_in_range, origins_of
+from headvox.clock import Clock
 from headvox.compile_masks import SCORE_UNIT, compile_cascade
 from headvox.config import DetectorConfig
-from headvox.cuda.device import BATCH, Device, DeviceLost, use_device
-from headvox.cuda.readings import Asked, Found
+from headvox.cuda.detect import DEVICE_STAGES, OnDevice
+from headvox.cuda.device import BATCH, DeviceLost, use_device
 from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.frames import as_rigid
-from headvox.fuse import Region
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners, shape_with_margins
+from headvox.keep import asks_cameras, keep, least_score, slack_of
 from headvox.kernels import Threads, read_only
 from headvox.memory import Memory, Stages
+from headvox.placing import Placing
 from headvox.pose import fit_poses
 from headvox.read_masks import load_cascade
-from headvox.refine import HAIR_M, cells_about, fit_spheres
+from headvox.refine import fit_spheres
 from headvox.simd import LANES
-from headvox.suppress import PEAK_REACH, local_maxima, suppress_overlaps
+from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, local_maxima
 from headvox.visibility import camera_table, count_states, look_about
 from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import (
-    Lattice,
-    Rays,
     mark_depth,
     mark_points,
     merge,
@@ -46,18 +45,8 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
-DEVICE_STAGES = ("search", "refine")
-"""On a GPU, all before the refinement is one stage, and includes the copies there and back."""
-SAME_HEAD_M = 0.18
-MOST_PEAKS = 256
 FEW = 512
 """Candidates that are scored before a second thread would have begun."""
-NEIGHBOURS = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
-STEPS = np.abs(NEIGHBOURS).sum(axis=1)
-AROUND = {1: NEIGHBOURS[STEPS == 0], 2: NEIGHBOURS[STEPS <= 1], 4: NEIGHBOURS}
-"""A peak and the voxels about it that were not candidates, when every voxel, every other, every fourth is one."""
-MOST_POSES = 32
-"""Heads of a frame that get a pose, best score first."""
 
 
 class Detector:
@@ -85,16 +74,16 @@ class Detector:
             self.config = replace(self.config, backend=backend)
         self._note = note or _warn
         self.cascade = compile_cascade(load_cascade(self.config.cascade), self.config.voxel_m)
-        self.on_device = self.config.backend != "cpu" and use_device(self.config.backend)
-        """Whether frames are searched on a GPU; it ends when the GPU fails."""
-        self.device: Device | None = None
-        """What searches on the GPU, once there was a frame."""
+        self.on_device = use_device(self.config.backend)
+        """Whether frames are looked at on a GPU; it ends when the GPU fails."""
+        self.device: OnDevice | None = None
+        """What looks at them there, once there was a frame."""
         self.stage_ms = dict.fromkeys(DEVICE_STAGES if self.on_device else STAGES, 0.0)
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
         self._threads = Threads(self.config.threads)
+        self._placing = Placing(self.config)
         self._memory: Memory | None = None
-        self._rays: dict[str, tuple[DepthImage, Lattice, Rays]] = {}
         self._looked_at: tuple[Memory, I32, I64] | None = None
 
     # ------------------------------------------------------------------------------------------- the public calls
@@ -129,7 +118,7 @@ class Detector:
         if self.on_device:
             return self._detect_on_device([frame], [expected])[0]
         check_frame(frame)
-        clock = _Clock(self.stage_ms)
+        clock = Clock(self.stage_ms)
         memory = self._memory_for(frame)
         memory.clear()
         occupied = self._voxelize(frame, memory)
@@ -156,8 +145,6 @@ class Detector:
         Raises:
             HeadvoxError: as :meth:`detect_frame`; of several, the first.
         """
-        if not self.on_device:
-            return [self.detect_frame(frame) for frame in frames]
         parts = [frames[first : first + BATCH] for first in range(0, len(frames), BATCH)]
         return [heads for part in parts for heads in self._detect_on_device(part, [None] * len(part))]
 
@@ -174,73 +161,28 @@ class Detector:
         if self._looked_at is None:
             return np.empty((0, 3)), np.empty(0)
         memory, survivors, scores = self._looked_at
-        centres = memory.lattice.centres(survivors + memory.first)
+        centres = memory.centres(survivors)
         return centres, np.where(scores > DROPPED, scores / SCORE_UNIT, np.nan)
 
     def close(self) -> None:
         """End the detector's threads."""
         self._threads.close()
 
-    # --------------------------------------------------------------------------------------------------- on a GPU
-
     def _detect_on_device(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
-        """Return the heads in up to :data:`BATCH` frames; where the GPU fails, by the CPU, and from then on."""
-        for frame in frames:
-            check_frame(frame)
-        clock = _Clock(self.stage_ms)
-        asked = [self._asked(frame, one) for frame, one in zip(frames, expected, strict=True)]
-        try:
-            found = self._device_of(asked[0].lattice).search(asked, self._rays_of)
-        except DeviceLost as error:
-            self._note(
-                f"the GPU failed ({error}): this frame is done again, and all further ones, on the CPU"
-            )
-            self.on_device, self.device = False, None
-            self.stage_ms = dict.fromkeys(STAGES, 0.0)
-            return [self.detect_frame(frame, one) for frame, one in zip(frames, expected, strict=True)]
-        clock.done("search")
-        heads = [self._refine_found(*each) for each in zip(asked, found, expected, strict=True)]
-        clock.done("refine")
-        return heads
-
-    def _asked(self, frame: Frame, expected: Expected | None) -> Asked:
-        """Return what the device is to do with ``frame``."""
-        memory = self._memory_for(frame)
-        kept = self._threshold(frame, memory) - (
-            self._slack() if expected is not None and len(expected) else 0
-        )
-        return Asked(frame, memory.lattice, self._sees(frame, memory), kept)
-
-    def _device_of(self, lattice: Lattice) -> Device:
-        if (
-            self.device is None
-            or self.device.shape != lattice.shape
-            or self.device.cascade is not self.cascade
-        ):
-            around = AROUND[self.cascade.gate.spacing]
-            self.device = Device(
-                self.cascade, lattice.shape, around, MOST_PEAKS, cells_about(lattice.voxel_m)
-            )
-        return self.device
-
-    def _refine_found(self, asked: Asked, found: Found, expected: Expected | None) -> Heads:
-        """Return the heads of a frame that the device searched: from here on it is as on the CPU."""
-        memory = self._memory_for(asked.frame)
-        memory.clear()
-        memory.dirty = (0, 0)
-        self.candidates = found.candidates
-        if not found.occupied:
-            raise nothing_in_range(asked.frame, asked.lattice.region)
-        memory.first = np.zeros(3, np.int64)
-        memory.enter_patches(found)
-        memory.make_room(len(found.cells))
-        memory.yaws[: len(found.cells)] = found.yaws
-        threshold = self._threshold(asked.frame, memory)
-        kept = self._kept(found.cells, found.scores, threshold, memory, expected)
-        peaks = np.flatnonzero(kept)
-        return self._refine(
-            asked.frame, found.cells[kept], found.scores[kept], peaks, threshold, memory, expected
-        )
+        """Return the heads in up to :data:`BATCH` frames by the GPU; where it failed, by the CPU, and from then on."""
+        if self.on_device:
+            self.device = self.device or OnDevice(self.config, self.cascade, self._threads)
+            try:
+                heads = self.device.detect(frames, expected, self.stage_ms)
+                self.candidates = self.device.candidates
+                return heads
+            except DeviceLost as error:
+                self._note(
+                    f"the GPU failed ({error}): this frame is done again, and all further ones, on the CPU"
+                )
+                self.on_device, self.device = False, None
+                self.stage_ms = dict.fromkeys(STAGES, 0.0)
+        return [self.detect_frame(frame, one) for frame, one in zip(frames, expected, strict=True)]
 
     # -------------------------------------------------------------------------------------------------- the stages
 
@@ -270,7 +212,7 @@ class Detector:
                     cells,
                 )
             for image in frame.depths:
-                rays, depth = self._rays_of(image, lattice), read_only(image.depth)
+                rays, depth = self._placing.rays(image, lattice), read_only(image.depth)
                 low, high = _share(depth.shape[0], part, parts)
                 mark_depth(
                     depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting,
@@ -387,40 +329,16 @@ class Detector:
         Returned are their cells, their scores, which of the peaks they were, and the threshold, in steps of the score.
         """
         cells, scores, judge = survivors[peaks], scores[peaks], memory.judge
+        sees = asks_cameras(frame, memory.sees)
         if judge is not None and len(cells):
             cells, scores, found = self._best_about(S, cells, judge, memory)
             peaks = peaks[found]
-            if self._sees(frame, memory) and len(cells):
+            if sees and len(cells):
                 scores = self._look_about(frame, S, cells, judge, memory)
-        threshold = self._threshold(frame, memory)
-        kept = self._kept(cells, scores, threshold, memory, expected)
-        return cells[kept], scores[kept], peaks[kept], threshold
-
-    def _sees(self, frame: Frame, memory: Memory) -> bool:
-        """Whether the judge can ask the cameras what they saw: not with clouds, of which nobody knows what is free."""
-        return memory.sees and len(frame.depths) > 0 and not frame.clouds
-
-    def _threshold(self, frame: Frame, memory: Memory) -> int:
-        """Return the least score of a head, in steps."""
-        cascade, least = self.cascade.source, self.config.min_score
-        if least is None:
-            blind = memory.sees and not self._sees(frame, memory)
-            least = cascade.min_score_occupied if blind else cascade.min_score
-        return math.ceil(least * SCORE_UNIT)
-
-    def _slack(self) -> int:
-        """Return how much less a head may score where one is expected, in steps."""
-        return math.floor(self.config.score_slack * SCORE_UNIT)
-
-    def _kept(
-        self, cells: I32, scores: I64, threshold: int, memory: Memory, expected: Expected | None
-    ) -> npt.NDArray[np.bool_]:
-        """Return which of the peaks reach the threshold, or nearly so where a head is expected."""
-        kept: npt.NDArray[np.bool_] = scores >= threshold
-        if expected is not None and len(expected):
-            weaker = scores >= threshold - self._slack()
-            kept |= weaker & self._is_expected(cells, expected, memory)
-        return kept
+        least = least_score(self.config, self.cascade.source, blind=memory.sees and not sees)
+        centres, slack = memory.centres(cells), slack_of(self.config, expected)
+        kept = keep(centres, scores, least, slack, expected, memory.lattice.voxel_m)
+        return cells[kept], scores[kept], peaks[kept], least
 
     def _best_about(
         self, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory
@@ -454,13 +372,6 @@ class Detector:
         self._score(S, cells, seen, judge, memory, scores, all_stages=True)
         return scores
 
-    def _is_expected(self, cells: I32, expected: Expected, memory: Memory) -> npt.NDArray[np.bool_]:
-        """Whether each of ``cells`` is within reach of any place where a head is expected."""
-        centres = memory.lattice.centres(cells + memory.first)
-        away = np.linalg.norm(centres[:, None] - expected.centres, axis=2)
-        within: npt.NDArray[np.bool_] = (away <= expected.reaches_m + memory.lattice.voxel_m).any(axis=1)
-        return within
-
     def _refine(
         self,
         frame: Frame,
@@ -471,68 +382,40 @@ class Detector:
         memory: Memory,
         expected: Expected | None,
     ) -> Heads:
-        count = len(cells)
-        if count == 0:
+        if len(cells) == 0:
             return Heads()
-        cells = cells + memory.first.astype(np.int32)
-        centres = memory.lattice.centres(cells)
-        radii = np.full(count, 0.1)
-        if self.config.refine != "none":
-            spheres = np.empty((count, 6))
-            lattice = memory.lattice
-            counting = self.cascade.source.counting
-            fit_spheres(
-                memory.cells[0], cells, lattice.voxel_m, lattice.subdivision, counting, memory.points, spheres
-            )
-            centres = centres + spheres[:, :3]
-            if len(origins_of(frame)):
-                centres[:, 2] -= HAIR_M
-            radii = spheres[:, 3]
-        kept = suppress_overlaps(centres, scores, SAME_HEAD_M)
-        quaternions = np.full((count, 4), np.nan)
-        if self.cascade.votes is not None:
-            half = 0.5 * self.cascade.votes.yaws_rad[memory.yaws[peaks]]
-            quaternions = np.stack([np.zeros(count), np.zeros(count), np.sin(half), np.cos(half)], axis=1)
-        heads = Heads(
-            centres[kept],
-            quaternions[kept],
-            radii[kept],
-            scores[kept] / SCORE_UNIT,
-            sure=scores[kept] >= least,
-        )
-        return self._fit_poses(frame, heads, memory, expected) if self.config.refine == "pose" else heads
+        spheres = None if self.config.refine == "none" else self._fit_spheres(cells, memory)
+        votes = self.cascade.votes
+        yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks]]
+        haired = len(origins_of(frame)) > 0
+        heads = heads_at(memory.centres(cells), scores, least, spheres, haired, yaws)
+        if self.config.refine != "pose":
+            return heads
+        best = heads.centres[:MOST_POSES]
+        return with_poses(heads, fit_poses(frame, best, memory.scratch, self._threads, expected))
 
-    def _fit_poses(self, frame: Frame, heads: Heads, memory: Memory, expected: Expected | None) -> Heads:
-        """Align the head template to the points about each of the best heads; the others stay as they are."""
-        best = slice(0, MOST_POSES)
-        poses = fit_poses(frame, heads.centres[best], memory.scratch, self._threads, expected)
-        fitted = np.isfinite(poses.radii)
-        centres, radii = heads.centres.copy(), heads.radii.copy()
-        quaternions = np.full((len(heads), 4), np.nan)
-        centre_covariances = np.full((len(heads), 3, 3), np.nan)
-        rotation_covariances = centre_covariances.copy()
-        centres[best][fitted], radii[best][fitted] = poses.centres[fitted], poses.radii[fitted]
-        quaternions[best] = poses.quaternions
-        centre_covariances[best] = poses.centre_covariances
-        rotation_covariances[best] = poses.rotation_covariances
-        kept = suppress_overlaps(centres, heads.scores, SAME_HEAD_M)  # two starts may have found one head
-        return Heads(
-            centres[kept],
-            quaternions[kept],
-            radii[kept],
-            heads.scores[kept],
-            centre_covariances[kept],
-            rotation_covariances[kept],
-            heads.sure[kept],
+    def _fit_spheres(self, cells: I32, memory: Memory) -> F64:
+        """Return the spheres (N, 6) that fit what lies about ``cells`` (N, 3) of the integral volume."""
+        spheres = np.empty((len(cells), 6))
+        lattice, counting = memory.lattice, self.cascade.source.counting
+        in_lattice = cells + memory.first.astype(np.int32)
+        fit_spheres(
+            memory.cells[0],
+            in_lattice,
+            lattice.voxel_m,
+            lattice.subdivision,
+            counting,
+            memory.points,
+            spheres,
         )
+        return spheres
 
     # -------------------------------------------------------------------------------------------- working memory
 
     def _memory_for(self, frame: Frame) -> Memory:
-        """Return the working memory, made anew only when the region moved."""
-        region = self._region(frame)
-        if self._memory is None or self._memory.lattice.region != region:
-            lattice = Lattice.over(region, self.cascade.voxel_m, self.cascade.source.subdivision)
+        """Return the working memory, made anew only when the region has another shape."""
+        lattice = self._placing.lattice(frame, self.cascade)
+        if self._memory is None or self._memory.lattice is not lattice:
             if self._memory is None or self._memory.lattice.shape != lattice.shape:
                 self._memory = Memory(
                     lattice, self.cascade, self.config.threads, self.config.refine == "pose"
@@ -540,42 +423,9 @@ class Detector:
             self._memory.place(lattice)
         return self._memory
 
-    def _region(self, frame: Frame) -> Region:
-        config, centre = self.config, self.config.centre
-        if centre is None:
-            origins = origins_of(frame)
-            x, y, z = origins.mean(axis=0).tolist() if len(origins) else (0.0, 0.0, 0.0)
-            centre = (x, y, z)
-        return Region(centre, config.max_range_m, config.min_height_m, config.max_height_m)
-
-    def _rays_of(self, image: DepthImage, lattice: Lattice) -> Rays:
-        known = self._rays.get(image.name)
-        if known is not None:
-            same, placed, rays = known
-            if (
-                placed is lattice
-                and same.intrinsics == image.intrinsics
-                and np.array_equal(same.T_world_camera, image.T_world_camera)
-            ):
-                return rays
-        rays = Rays.of(image, lattice)
-        self._rays[image.name] = (replace(image, T_world_camera=image.T_world_camera.copy()), lattice, rays)
-        return rays
-
 
 def _warn(text: str) -> None:
     warnings.warn(f"headvox: {text}", RuntimeWarning, stacklevel=4)
-
-
-class _Clock:
-    def __init__(self, stage_ms: dict[str, float]) -> None:
-        self.stage_ms = stage_ms
-        self.last = time.perf_counter()
-
-    def done(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.stage_ms[stage] = 1e3 * (now - self.last)
-        self.last = now
 
 
 def _first_column(columns: int, part: int, parts: int) -> int:

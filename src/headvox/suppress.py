@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import numpy.typing as npt
 
@@ -13,6 +15,13 @@ PEAK_REACH = {1: 1, 2: 1, 4: 2}
 """How far the neighbours of a voxel are when every voxel, every other, every fourth is a candidate."""
 
 I64 = npt.NDArray[np.int64]
+
+MOST_PEAKS = 256
+"""Peaks of a frame that are looked at closer: a frame of noise must not take forever."""
+NEIGHBOURS = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
+STEPS = np.abs(NEIGHBOURS).sum(axis=1)
+AROUND = {1: NEIGHBOURS[STEPS == 0], 2: NEIGHBOURS[STEPS <= 1], 4: NEIGHBOURS}
+"""A peak and the voxels about it that were not candidates, when every voxel, every other, every fourth is one."""
 
 
 @kernel

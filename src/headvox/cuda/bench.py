@@ -55,7 +55,7 @@ def measure(
     for _ in range(rounds):
         for name, call in calls.items():
             ms[name].append(_timed(call))
-    search = bare.device.for_frames(1) if bare.device is not None else None
+    search = bare.device.device.for_frames(1) if bare.device and bare.device.device else None
     if search is None:
         raise HeadvoxError("The GPU failed while it was measured.", "What it said is above.")
     sensors = len(images)

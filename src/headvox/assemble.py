@@ -1,0 +1,70 @@
+"""From what was fitted to the peaks to heads: of those that overlap, the best."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.compile_masks import SCORE_UNIT
+from headvox.data import F64, Heads
+from headvox.pose import Poses
+from headvox.refine import HAIR_M
+from headvox.suppress import suppress_overlaps
+
+I64 = npt.NDArray[np.int64]
+
+SAME_HEAD_M = 0.18
+MOST_POSES = 32
+"""Heads of a frame that get a pose, best score first."""
+RADIUS_M = 0.1  # of a head to which no sphere was fitted
+
+
+def heads_at(
+    centres: F64, scores: I64, least: int, spheres: F64 | None, haired: bool, yaws: F64 | None
+) -> Heads:
+    """Return the heads at voxels whose ``centres`` are (N, 3) metres, world, and whose ``scores`` (N,) are in steps.
+
+    ``spheres`` (N, 6) were fitted about the voxels (:func:`headvox.refine.fit_spheres`); ``haired`` says that they lie
+    on hair, not on the skull. ``yaws`` (N,) are in radians, if known. Heads that score ``least`` are sure.
+    """
+    count = len(centres)
+    radii = np.full(count, RADIUS_M)
+    if spheres is not None:
+        centres, radii = centres + spheres[:, :3], spheres[:, 3]
+        if haired:
+            centres[:, 2] -= HAIR_M
+    quaternions = np.full((count, 4), np.nan)
+    if yaws is not None:
+        half = 0.5 * yaws
+        quaternions = np.stack([np.zeros(count), np.zeros(count), np.sin(half), np.cos(half)], axis=1)
+    kept = suppress_overlaps(centres, scores, SAME_HEAD_M)
+    return Heads(
+        centres[kept],
+        quaternions[kept],
+        radii[kept],
+        scores[kept] / SCORE_UNIT,
+        sure=scores[kept] >= least,
+    )
+
+
+def with_poses(heads: Heads, poses: Poses) -> Heads:
+    """Return ``heads``, of which the first were fitted these ``poses``; the others stay as they are."""
+    best, fitted = slice(0, len(poses.radii)), np.isfinite(poses.radii)
+    centres, radii = heads.centres.copy(), heads.radii.copy()
+    quaternions = np.full((len(heads), 4), np.nan)
+    centre_covariances = np.full((len(heads), 3, 3), np.nan)
+    rotation_covariances = centre_covariances.copy()
+    centres[best][fitted], radii[best][fitted] = poses.centres[fitted], poses.radii[fitted]
+    quaternions[best] = poses.quaternions
+    centre_covariances[best] = poses.centre_covariances
+    rotation_covariances[best] = poses.rotation_covariances
+    kept = suppress_overlaps(centres, heads.scores, SAME_HEAD_M)  # two starts may have found one head
+    return Heads(
+        centres[kept],
+        quaternions[kept],
+        radii[kept],
+        heads.scores[kept],
+        centre_covariances[kept],
+        rotation_covariances[kept],
+        heads.sure[kept],
+    )

@@ -1,0 +1,53 @@
+"""Which of the judged peaks are heads: those that reach the cascade's threshold, or nearly so where one is expected."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.compile_masks import SCORE_UNIT
+from headvox.config import DetectorConfig
+from headvox.data import F64, Expected, Frame
+from headvox.masks import Cascade
+
+I64 = npt.NDArray[np.int64]
+
+
+def asks_cameras(frame: Frame, sees: bool) -> bool:
+    """Return whether a cascade that ``sees`` can ask the cameras: not with clouds, of which nobody knows the rays."""
+    return sees and len(frame.depths) > 0 and not frame.clouds
+
+
+def least_score(config: DetectorConfig, cascade: Cascade, blind: bool) -> int:
+    """Return the least score of a head, in steps; ``blind`` says that the cascade could not ask the cameras."""
+    least = config.min_score
+    if least is None:
+        least = cascade.min_score_occupied if blind else cascade.min_score
+    return math.ceil(least * SCORE_UNIT)
+
+
+def slack_of(config: DetectorConfig, expected: Expected | None) -> int:
+    """Return how much less a head may score where one is ``expected``, in steps; 0 where none is."""
+    return 0 if expected is None or len(expected) == 0 else math.floor(config.score_slack * SCORE_UNIT)
+
+
+def keep(
+    centres: F64, scores: I64, least: int, slack: int, expected: Expected | None, voxel_m: float
+) -> npt.NDArray[np.bool_]:
+    """Return which of the peaks at ``centres`` (N, 3) metres, world, are heads: (N,).
+
+    ``scores`` (N,) and the other two are in steps.
+    """
+    kept: npt.NDArray[np.bool_] = scores >= least
+    if expected is not None and len(expected):
+        kept |= (scores >= least - slack) & _is_expected(centres, expected, voxel_m)
+    return kept
+
+
+def _is_expected(centres: F64, expected: Expected, voxel_m: float) -> npt.NDArray[np.bool_]:
+    """Return whether each of ``centres`` is within reach of any place where a head is expected."""
+    away = np.linalg.norm(centres[:, None] - expected.centres, axis=2)
+    within: npt.NDArray[np.bool_] = (away <= expected.reaches_m + voxel_m).any(axis=1)
+    return within

@@ -18,7 +18,6 @@ from functools import partial
 from operator import contains
 from pathlib import Path
 
-import rclpy
 from geometry_msgs.msg import PoseArray
 
 from headvox.errors import HeadvoxError
@@ -106,24 +105,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if args.frames < 1:
         parser.error(f"--frames: expected 1 or more, got {args.frames}")
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    try:
-        os.environ.setdefault("FASTDDS_DEFAULT_PROFILES_FILE", str(processes.profile()))
-        processes.init(["--ros-args", "-p", f"recording:={args.recording}"])
+
+    def measure() -> None:
         print("  frames  seconds  resident MB  threads  files")
         for row in endure(args.recording, args.frames):
             print(
                 f"{row.frames:8d}{row.seconds:9.1f}{row.memory_mb:13.1f}{row.threads:9d}{row.files:7d}",
                 flush=True,
             )
-    except HeadvoxError as error:
-        print(f"endurance: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-    finally:
-        rclpy.try_shutdown()
-    return 0
+
+    return processes.run(
+        "endurance", measure, ["--ros-args", "-p", f"recording:={args.recording}"], measurement=True
+    )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ import time
 from collections.abc import Container, Iterator
 from pathlib import Path
 
-import rclpy
 from geometry_msgs.msg import Point, Pose, Quaternion
 from rclpy.node import Node
 
@@ -126,17 +125,7 @@ def _true_heads(folder: Path) -> dict[int, list[Pose]]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; return its exit code."""
-    processes.init(arguments)
-    try:
-        Player().play()
-    except HeadvoxError as error:
-        print(f"play_recording: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        rclpy.try_shutdown()
-    return 0
+    return processes.run("play_recording", lambda: Player().play(), arguments)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -51,10 +52,30 @@ def spin_until(
     return done
 
 
-def init(arguments: Sequence[str] | None = None) -> None:
-    """Begin with ROS; SIGINT and SIGTERM raise KeyboardInterrupt, so that what was started can be ended."""
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+def run(
+    name: str, work: Callable[[], None], arguments: Sequence[str] | None = None, *, measurement: bool = False
+) -> int:
+    """Do ``work`` within ROS, and return the exit code: 0, or 1 where it failed.
+
+    SIGINT and SIGTERM raise KeyboardInterrupt, so that what was started can be ended. A node then ends with 0; a
+    ``measurement``, which is not complete, with 130. One of those also keeps to this machine, and lets large clouds go
+    through shared memory, unless the environment says otherwise.
+    """
+    try:
+        if measurement:
+            os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+            os.environ.setdefault("FASTDDS_DEFAULT_PROFILES_FILE", str(profile()))
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        work()
+    except HeadvoxError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130 if measurement else 0
+    finally:
+        rclpy.try_shutdown()
+    return 0
 
 
 def topics(recording: str, topic: str) -> list[str]:

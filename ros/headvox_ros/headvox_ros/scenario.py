@@ -7,7 +7,6 @@ other node would, and prints what came of it.
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import sys
 import tempfile
@@ -159,21 +158,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--loops", type=int, default=1, help="how often to play it (1)")
     parser.add_argument("--silent", default="", help="NAME:FROM:TO, a camera that stops for some seconds")
     args = parser.parse_args(arguments)
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    try:
-        os.environ.setdefault("FASTDDS_DEFAULT_PROFILES_FILE", str(processes.profile()))
-        processes.init()
+
+    def measure() -> None:
         heard = play(args.recording, args.input, args.rate, args.loops, args.silent)
         for name, value in report(args.recording, heard, args.rate, args.loops).items():
             print(f"{name:32} {value:.4g}")
-    except HeadvoxError as error:
-        print(f"scenario: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-    finally:
-        rclpy.try_shutdown()
-    return 0
+
+    return processes.run("scenario", measure, measurement=True)
 
 
 if __name__ == "__main__":

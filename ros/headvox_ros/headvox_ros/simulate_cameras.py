@@ -9,7 +9,6 @@ from __future__ import annotations
 import sys
 import time
 
-import rclpy
 from geometry_msgs.msg import Point, Pose, Quaternion
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
@@ -71,17 +70,7 @@ def true_heads(scene: Scene, stamp_ns: int) -> list[Pose]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; return its exit code."""
-    processes.init(arguments)
-    try:
-        Simulation().run()
-    except HeadvoxError as error:
-        print(f"simulate_cameras: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        rclpy.try_shutdown()
-    return 0
+    return processes.run("simulate_cameras", lambda: Simulation().run(), arguments)
 
 
 if __name__ == "__main__":

@@ -138,13 +138,12 @@ def _add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
     A[5, RESIDUAL] += weight * wz * e
 
 
-@bare_kernel
-def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, state, J, A, told):  # type: ignore[no-untyped-def]
-    """Return the cost of ``state``; write the normal equations to ``A`` (PARAMETERS, PARAMETERS + 1), if it ``steps``.
+@rule
+def weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told):  # type: ignore[no-untyped-def]
+    """Return twice what the first ``n`` points and ``m`` rays cost in ``state``, and how many of them would move it.
 
-    The first ``n`` points and ``m`` rays count. ``modes`` are fitted, ``k`` is the scale of rho, ``upright`` says
-    whether the priors on pitch and roll hold. ``J`` is scrap; ``told`` receives the points' share of the cost, how
-    many lie on the surface, and how many rays cross it.
+    These have a column in ``J`` each, if it ``steps``. ``told`` receives the points' share of the cost, how many lie on
+    the surface, and how many rays cross it.
     """
     cx, cy, cz = state[0], state[1], state[2]
     r00, r01, r02 = state[3], state[4], state[5]
@@ -155,7 +154,6 @@ def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, 
     metres = scale * voxel_m
     lx, ly, lz = low[0] / voxel_m, low[1] / voxel_m, low[2] / voxel_m
     nx, ny, nz = rows.shape[0], rows.shape[1], rows.shape[2]
-    size = 7 + modes
     k2 = k * k
     cost = 0.0
     count = on = crossed = 0
@@ -223,13 +221,33 @@ def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, 
     if m == 0:
         told[COST] = 0.5 * cost
     told[ON_SURFACE], told[CROSSED] = on, crossed
+    return cost, count
+
+
+@rule
+def add_prior_cost(cost, state, modes, upright):  # type: ignore[no-untyped-def]
+    """Return ``cost`` and twice what the priors make ``state`` cost; with those on pitch and roll, if ``upright``."""
     for i in range(3):
         cost += state[i] * state[i] / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
     cost += state[12] * state[12] / (SCALE_SIGMA * SCALE_SIGMA)
     for i in range(modes):
         cost += state[13 + i] * state[13 + i]
     if upright:  # r20 r21 r22 is the world's up in the head's axes
+        r20, r21 = state[9], state[10]
         cost += r20 * r20 / (PITCH_SIGMA * PITCH_SIGMA) + r21 * r21 / (ROLL_SIGMA * ROLL_SIGMA)
+    return cost
+
+
+@bare_kernel
+def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, state, J, A, told):  # type: ignore[no-untyped-def]
+    """Return the cost of ``state``; write the normal equations to ``A`` (PARAMETERS, PARAMETERS + 1), if it ``steps``.
+
+    The first ``n`` points and ``m`` rays count. ``modes`` are fitted, ``k`` is the scale of rho, ``upright`` says
+    whether the priors on pitch and roll hold. ``J`` is scrap; for ``told`` see :func:`weigh`.
+    """
+    size = 7 + modes
+    cost, count = weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told)
+    cost = add_prior_cost(cost, state, modes, upright)
     if steps:
         whole = max((count + LANES - 1) // LANES, 1) * LANES
         for i in range(WEIGHTED):
@@ -368,6 +386,30 @@ def refine(work, used, rays, upright, template, at):  # type: ignore[no-untyped-
     _invert(A, x, work.covariances[at])
 
 
+@rule
+def pick(costs, count, least, coarse, fine, refined):  # type: ignore[no-untyped-def]
+    """Return the best of the ``count`` starts that is not done yet, and mark it as done; -1 where none is worth it.
+
+    The best one cost ``least``. A start that came to what was ``refined`` before is not worth it.
+    """
+    while True:
+        best = np.int64(0)
+        for i in range(count):
+            if costs[i] < costs[best]:
+                best = i  # type: ignore[assignment]
+        if costs[best] == np.inf or (refined >= 2 and costs[best] > least + MARGIN):
+            return np.int64(-1)
+        costs[best] = np.inf
+        known = False
+        for j in range(refined):
+            trace = 0.0
+            for q in range(3, 12):
+                trace += coarse[best, q] * fine[j, q]
+            known = known or trace > ALIKE
+        if not known:
+            return best
+
+
 @bare_kernel
 def align(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def]
     """Try all ``starts`` (S, 9) on the ``n`` samples and ``m`` rays of ``work``, and refine the best.
@@ -389,21 +431,9 @@ def align(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def
         least = min(least, costs[i])
     refined = np.int64(0)
     while refined < MOST_REFINED:
-        best = 0
-        for i in range(count):
-            if costs[i] < costs[best]:
-                best = i
-        if costs[best] == np.inf or (refined >= 2 and costs[best] > least + MARGIN):
+        best = pick(costs, count, least, coarse, fine, refined)
+        if best < 0:
             break
-        costs[best] = np.inf
-        known = False
-        for j in range(refined):
-            trace = 0.0
-            for q in range(3, 12):
-                trace += coarse[best, q] * fine[j, q]
-            known = known or trace > ALIKE
-        if known:
-            continue
         for j in range(STATE):
             fine[refined, j] = coarse[best, j]
         refine(work, used, rays, upright, template, refined)

@@ -21,6 +21,7 @@ MOST_SAMPLES = 8192  # of one candidate, shared by all sensors
 MOST_PIXELS = 4096  # of one image that are looked at for a candidate
 MOST_VISITS = 1 << 17  # points of one cloud that are looked at for a candidate
 SAMPLE = 8  # x y z, the unit ray from the sensor, sigma along the ray, sigma across
+FAR, NEAR, PASSES = 0, 1, 2  # what a reading is to a candidate
 RAY = 6  # its point nearest to the candidate, its direction
 PIXEL_SIGMA = 0.7  # a contour wanders by so many pixels
 DEPTH_SIGMA_M = 0.0015  # at the sensor, and
@@ -67,6 +68,57 @@ def _window(middle, depth, reach, focal, centre, size):  # type: ignore[no-untyp
     return int(min(max(first, 0.0), size)), int(min(max(last + 2.0, 0.0), size))
 
 
+@rule
+def window_of(lens, T, reach, height, width, most):  # type: ignore[no-untyped-def]
+    """Return the origin's place in the camera's frame, and which columns and rows of an image to look at, and how many.
+
+    ``most`` pixels are looked at: every ``stride``-th of columns u0 to u1 and rows v0 to v1.
+    """
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    ox = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
+    oy = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
+    oz = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
+    u0, u1 = _window(ox, oz, reach, fx, cx, width)
+    v0, v1 = _window(oy, oz, reach, fy, cy, height)
+    if oz < -reach:
+        u1, v1 = u0, v0
+    stride = 1
+    while ((u1 - u0 + stride - 1) // stride) * ((v1 - v0 + stride - 1) // stride) > max(1, most):
+        stride += 1
+    return (ox, oy, oz), u0, u1, v0, v1, stride
+
+
+@rule
+def look_at_pixel(raw, u, v, lens, origin, reach):  # type: ignore[no-untyped-def]
+    """Return what a pixel shows, the x and y of its ray (z is 1) and its depth, the ray's length, and where along it.
+
+    It is where the ray is nearest to the origin.
+    """
+    if raw == 0:
+        return FAR, 0.0, 0.0, 0.0, 1.0, 0.0
+    ox, oy, oz = origin
+    x = (u - lens[2]) / lens[0]
+    y = (v - lens[3]) / lens[1]
+    z = raw * lens[4]
+    length = np.sqrt(x * x + y * y + 1.0)
+    dx, dy, dz = x * z - ox, y * z - oy, z - oz
+    if dx * dx + dy * dy + dz * dz < reach * reach:
+        return NEAR, x, y, z, length, 0.0
+    along = (x * ox + y * oy + oz) / length
+    distance2 = ox * ox + oy * oy + oz * oz
+    passes = distance2 - along * along < reach * reach and 0.0 < along < z * length
+    return PASSES if passes else FAR, x, y, z, length, along
+
+
+@rule
+def keep_pixel(T, x, y, z, length, lens, samples, n):  # type: ignore[no-untyped-def]
+    """Write what :func:`look_at_pixel` told of a pixel to samples[n]."""
+    _view(T, x, y, 1.0, length, samples, n)
+    _place(T, z * length, samples, n)
+    samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * z * z
+    samples[n, 7] = PIXEL_SIGMA * z / lens[0]
+
+
 @bare_kernel
 def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
     """Add what one depth image shows near the origin of the frame that ``T`` (3, 4) maps the camera to.
@@ -75,40 +127,15 @@ def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  #
     within ``reach`` and end behind it to ``rays``, after the ``n`` and ``m`` that are there; there may be ``most_n``
     and ``most_m``. Returned is how many there are then.
     """
-    fx, fy, cx, cy, scale = lens[0], lens[1], lens[2], lens[3], lens[4]
-    # the origin in the camera's frame
-    ox = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
-    oy = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
-    oz = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
-    if oz < -reach:
-        return n, m
-    u0, u1 = _window(ox, oz, reach, fx, cx, depth.shape[1])
-    v0, v1 = _window(oy, oz, reach, fy, cy, depth.shape[0])
-    most = max(1, min(MOST_PIXELS, most_n - n))
-    stride = 1
-    while ((u1 - u0 + stride - 1) // stride) * ((v1 - v0 + stride - 1) // stride) > most:
-        stride += 1
-    reach2, distance2 = reach * reach, ox * ox + oy * oy + oz * oz
+    most = min(MOST_PIXELS, most_n - n)
+    origin, u0, u1, v0, v1, stride = window_of(lens, T, reach, depth.shape[0], depth.shape[1], most)
     for v in range(v0, v1, stride):
-        y = (v - cy) / fy
         for u in range(u0, u1, stride):
-            raw = depth[v, u]
-            if raw == 0:
-                continue
-            x = (u - cx) / fx
-            z = raw * scale
-            length = np.sqrt(x * x + y * y + 1.0)
-            dx, dy, dz = x * z - ox, y * z - oy, z - oz
-            if dx * dx + dy * dy + dz * dz < reach2:
-                if n < most_n:
-                    _view(T, x, y, 1.0, length, samples, n)
-                    _place(T, z * length, samples, n)
-                    samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * z * z
-                    samples[n, 7] = PIXEL_SIGMA * z / fx
-                    n += 1
-                continue
-            along = (x * ox + y * oy + oz) / length  # where the ray is nearest to the origin
-            if distance2 - along * along < reach2 and 0.0 < along < z * length and m < most_m:
+            kind, x, y, z, length, along = look_at_pixel(depth[v, u], u, v, lens, origin, reach)
+            if kind == NEAR and n < most_n:
+                keep_pixel(T, x, y, z, length, lens, samples, n)
+                n += 1
+            elif kind == PASSES and m < most_m:
                 _view(T, x, y, 1.0, length, rays, m)
                 _place(T, along, rays, m)
                 m += 1
@@ -147,14 +174,55 @@ def _may_be_near(flat, at, ball, knows):  # type: ignore[no-untyped-def]
     return below(add(add(mul(dx, dx), mul(dy, dy)), mul(dz, dz)), fill(wide2))
 
 
+@rule
+def look_at_point(points, i, T, knows, reach):  # type: ignore[no-untyped-def]
+    """Return what a point shows, its turned coordinates, the square of its distance from the sensor, and where along.
+
+    It is where its ray is nearest to the origin, times the ray's length.
+    """
+    px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+    x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz
+    y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz
+    z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz
+    ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
+    squared = x * x + y * y + z * z
+    wx, wy, wz = x + ox, y + oy, z + oz
+    if wx * wx + wy * wy + wz * wz < reach * reach:
+        return NEAR, x, y, z, squared, 0.0
+    along = -(x * ox + y * oy + z * oz)
+    distance2 = ox * ox + oy * oy + oz * oz
+    if knows and 0.0 < along < squared and distance2 - along * along / squared < reach * reach:
+        return PASSES, x, y, z, squared, along
+    return FAR, x, y, z, squared, along
+
+
+@rule
+def keep_point(T, x, y, z, squared, knows, samples, n):  # type: ignore[no-untyped-def]
+    """Write what :func:`look_at_point` told of a point that is near to samples[n]."""
+    samples[n, 0], samples[n, 1], samples[n, 2] = x + T[0, 3], y + T[1, 3], z + T[2, 3]
+    samples[n, 3], samples[n, 4], samples[n, 5] = 0.0, 0.0, 0.0
+    samples[n, 6], samples[n, 7] = 0.0, UNKNOWN_SIGMA_M
+    if knows:
+        length = max(np.sqrt(squared), 1e-6)
+        samples[n, 3], samples[n, 4], samples[n, 5] = x / length, y / length, z / length
+        samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * squared
+        samples[n, 7] = PIXEL_SIGMA * length / CLOUD_FOCAL_PX
+
+
+@rule
+def keep_passing(T, x, y, z, squared, along, rays, m):  # type: ignore[no-untyped-def]
+    """Write what :func:`look_at_point` told of a point whose ray passes by to rays[m]."""
+    length = np.sqrt(squared)
+    rays[m, 3], rays[m, 4], rays[m, 5] = x / length, y / length, z / length
+    _place(T, along / length, rays, m)
+
+
 @bare_kernel
 def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
     """Add what a cloud shows; ``T`` (3, 4) maps its frame, ``knows`` says whether the sensor is at its origin.
 
     When there is more than ``most_n`` or ``most_m``, every second one is kept, so the rest stays evenly spread.
     """
-    ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
-    reach2, distance2 = reach * reach, ox * ox + oy * oy + oz * oz
     first_n, first_m = n, m
     hits, passes, every_hit, every_pass = 0, 0, 1, 1
     step = max(1, (points.shape[0] + MOST_VISITS - 1) // MOST_VISITS)
@@ -169,38 +237,22 @@ def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):
             bits &= bits - np.uint32(1)
             if i % step or i >= points.shape[0]:
                 continue
-            px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz
-            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz
-            squared = x * x + y * y + z * z
-            wx, wy, wz = x + ox, y + oy, z + oz
-            if wx * wx + wy * wy + wz * wz < reach2:
+            kind, x, y, z, squared, along = look_at_point(points, i, T, knows, reach)
+            if kind == NEAR:
                 hits += 1
                 if hits % every_hit == 0:
                     if n == most_n:
                         n = _thin(samples, first_n, n)
                         every_hit *= 2
-                    samples[n, 0], samples[n, 1], samples[n, 2] = wx, wy, wz
-                    samples[n, 3], samples[n, 4], samples[n, 5] = 0.0, 0.0, 0.0
-                    samples[n, 6], samples[n, 7] = 0.0, UNKNOWN_SIGMA_M
-                    if knows:
-                        length = max(np.sqrt(squared), 1e-6)
-                        samples[n, 3], samples[n, 4], samples[n, 5] = x / length, y / length, z / length
-                        samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * squared
-                        samples[n, 7] = PIXEL_SIGMA * length / CLOUD_FOCAL_PX
+                    keep_point(T, x, y, z, squared, knows, samples, n)
                     n += 1
-                continue
-            along = -(x * ox + y * oy + z * oz)  # times the ray's length: where it is nearest to the origin
-            if knows and 0.0 < along < squared and distance2 - along * along / squared < reach2:
+            elif kind == PASSES:
                 passes += 1
                 if passes % every_pass == 0:
                     if m == most_m:
                         m = _thin(rays, first_m, m)
                         every_pass *= 2
-                    length = np.sqrt(squared)
-                    rays[m, 3], rays[m, 4], rays[m, 5] = x / length, y / length, z / length
-                    _place(T, along / length, rays, m)
+                    keep_passing(T, x, y, z, squared, along, rays, m)
                     m += 1
     return n, m
 

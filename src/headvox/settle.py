@@ -53,20 +53,30 @@ def fit_head(work, n, m, centre, expected, upright, anyhow, template, poses, i):
 @bare_kernel
 def is_round(samples, n):  # type: ignore[no-untyped-def]
     """Whether points whose sensor nobody knows lie all around: a shell, whose neck and gravity need not be right."""
+    seen, near, x, y, z = lean(samples, 0, n)
+    return not seen and near >= LEAST_SAMPLES and np.sqrt(x * x + y * y + z * z) < ROUND_SHARE * near
+
+
+@rule
+def lean(samples, first, after):  # type: ignore[no-untyped-def]
+    """Return whether a sensor is known of samples[first:after], how many are near, and the sum of their directions.
+
+    Where one is known, nothing else is told.
+    """
     near = 0
     x = y = z = 0.0
-    for s in range(n):
+    for s in range(first, after):
         px, py, pz = samples[s, 0], samples[s, 1], samples[s, 2]
         squared = px * px + py * py + pz * pz
         if squared < ROUND_M * ROUND_M:
             if samples[s, 3] != 0.0 or samples[s, 4] != 0.0 or samples[s, 5] != 0.0:
-                return False
+                return True, 0, 0.0, 0.0, 0.0
             near += 1
             length = max(np.sqrt(squared), 1e-9)
             x += px / length
             y += py / length
             z += pz / length
-    return near >= LEAST_SAMPLES and np.sqrt(x * x + y * y + z * z) < ROUND_SHARE * near
+    return False, near, x, y, z
 
 
 @bare_kernel

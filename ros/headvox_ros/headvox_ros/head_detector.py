@@ -78,17 +78,20 @@ class HeadDetector(SensorNode):
         self._board = outputs.MarkerBoard(self.get_parameter("marker_lifetime_s").value)
 
     def process(self, frame: Frame) -> None:
-        """Find the heads of a frame and publish them, with the frame's stamp."""
+        """Find the heads of a frame, and publish them with the frame's stamp on the topics that somebody listens to."""
         self._heed_parameters()
         heads = self._look(frame)
         seen = [head for head in heads if head.is_seen]
         header = outputs.header_of(frame.stamp_ns, self.get_parameter("target_frame").value)
-        if self._heads is not None:
+        if self._poses.get_subscription_count():
+            self._poses.publish(as_message(PoseArray, outputs.poses(header, seen)))
+        if self._heads is not None and self._heads.get_subscription_count():
             self._heads.publish(as_message(vision.Detection3DArray, outputs.detections(header, seen)))
-        self._poses.publish(as_message(PoseArray, outputs.poses(header, seen)))
-        self._markers.publish(as_message(MarkerArray, self._board.show(header, heads)))
-        for track in outputs.tracks(header, heads):
-            self._tracks.publish(as_message(Odometry, track))
+        if self._tracks.get_subscription_count():
+            for track in outputs.tracks(header, heads):
+                self._tracks.publish(as_message(Odometry, track))
+        if self._markers.get_subscription_count():
+            self._markers.publish(as_message(MarkerArray, self._board.show(header, heads)))
         if self.get_parameter("publish_tf").value:
             self._tf.publish(as_message(TFMessage, outputs.frames(header, heads)))
 

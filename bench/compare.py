@@ -1,6 +1,6 @@
 """Two states of the repository side by side: is a change faster?
 
-    python bench/compare.py OLD [NEW] [--turns 6] [--frames 60] [--cascade NAME|FILE]
+    python bench/compare.py OLD [NEW] [--turns 6] [--frames 60] [--cascade NAME|FILE] [--refine pose]
 
 OLD and NEW are commits (anything that git knows: HEAD~3, a branch, a tag); NEW is the working tree by default, and
 "." names the working tree too. Each commit's files are laid out in a temporary folder by `git archive`, so neither
@@ -20,6 +20,7 @@ import sys
 import tarfile
 import tempfile
 import time
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -37,6 +38,7 @@ def main() -> int:
     parser.add_argument("--turns", type=int, default=6)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--cascade", default="default")
+    parser.add_argument("--refine", default="pose", help="pose, sphere or none")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="headvox-compare-") as name:
         folder = Path(name)
@@ -44,11 +46,8 @@ def main() -> int:
         frames = folder / "frames.npz"
         save_frames(frames)
         for source in sources:
-            measure(source, frames, args.cascade, 2)
-        turns = [
-            [measure(s, frames, args.cascade, args.frames) for s in sources]
-            for _ in range(max(args.turns, 1))
-        ]
+            measure(source, frames, args, 2)
+        turns = [[measure(s, frames, args, args.frames) for s in sources] for _ in range(max(args.turns, 1))]
     print(f"{'ms':24s} {'old':>9s} {'new':>9s}   new / old")
     for case in turns[0][0]:
         old, new = np.array([[turn[0][case], turn[1][case]] for turn in turns]).T
@@ -85,9 +84,10 @@ def save_frames(file: Path) -> None:
     np.savez(file, **arrays)
 
 
-def measure(source: Path, frames: Path, cascade: str, count: int) -> dict[str, float]:
+def measure(source: Path, frames: Path, args: argparse.Namespace, count: int) -> dict[str, float]:
     """Return the medians [ms] of a fresh process that imports headvox from ``source``."""
-    command = [sys.executable, str(Path(__file__).resolve()), "--child", str(frames), cascade, str(count)]
+    settings = [str(frames), args.cascade, args.refine, str(count)]
+    command = [sys.executable, str(Path(__file__).resolve()), "--child", *settings]
     environment = {**os.environ, "PYTHONPATH": str(source)}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
@@ -96,7 +96,7 @@ def measure(source: Path, frames: Path, cascade: str, count: int) -> dict[str, f
     return medians
 
 
-def child(file: str, cascade: str, count: int) -> None:
+def child(file: str, cascade: str, refine: str, count: int) -> None:
     """Measure, and print the medians."""
     from headvox import DepthImage, Detector, Intrinsics
     from headvox.config import DetectorConfig
@@ -108,15 +108,13 @@ def child(file: str, cascade: str, count: int) -> None:
         camera = Intrinsics(depth.shape[1], depth.shape[0], *lens)
         images.append(DepthImage(f"camera {k}", depth, camera, data[f"T{k}"]))
     cloud, shell = data["cloud"], data["shell"]
-    base = DetectorConfig(cascade=cascade, max_range_m=3.5, centre=(0.0, 0.0, 1.65))
-    one, two, three = (
-        Detector(base),
-        Detector(base),
-        Detector(DetectorConfig(cascade=cascade, max_range_m=3.5)),
-    )
+    alone = DetectorConfig(cascade=cascade, refine=refine, max_range_m=3.5)
+    base = replace(alone, centre=(0.0, 0.0, 1.65))
+    one, two, both, three = (Detector(config) for config in (base, base, replace(base, threads=2), alone))
     cases = {
         "detect, cloud": lambda: one.detect(cloud),
         "detect_depth": lambda: two.detect_depth(images),
+        "detect_depth, 2 threads": lambda: both.detect_depth(images),
         "detect, shell": lambda: three.detect(shell),
     }
     ms: dict[str, list[float]] = {name: [] for name in cases}
@@ -130,6 +128,6 @@ def child(file: str, cascade: str, count: int) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
-        child(sys.argv[2], sys.argv[3], int(sys.argv[4]))
+        child(sys.argv[2], sys.argv[3], sys.argv[4], int(sys.argv[5]))
     else:
         sys.exit(main())

@@ -218,7 +218,7 @@ def test_shares_of_a_part_of_the_volume_are_together_that_part(spacing, shape):
     gate = compile_cascade(cascade).gate
     margin = -box_reach(gate.boxes)[0::2]
     S = with_margins(integral_volume(cells), box_reach(gate.boxes))
-    corners = np.empty((len(gate.boxes), 8), np.uint64)
+    corners = np.empty((len(gate.boxes), 8), np.int64)
     set_corners(S, gate.boxes, corners)
     for odd in ((0, 0, 0), (1, 0, 1), (0, 1, 1)):
         low = rng.integers(0, np.array(shape) // 2)

@@ -18,6 +18,7 @@ from headvox.simd import (
     choose,
     compress,
     equal,
+    evens,
     fill,
     larger,
     last,
@@ -26,7 +27,9 @@ from headvox.simd import (
     load_triples,
     lowest,
     mul,
+    odds,
     running_sums,
+    shift_left,
     shift_right,
     shifted,
     smaller,
@@ -78,6 +81,9 @@ def integers(a, b, at, out):
     store(flat, 3 * LANES, shifted(x, y))
     store(flat, 4 * LANES, where(below(x, y), x, y))
     store(flat, 5 * LANES, where(equal(x, y), x, fill(b[at])))
+    store(flat, 6 * LANES, shift_left(x, 3))
+    store(flat, 7 * LANES, evens(x, y))
+    store(flat, 8 * LANES, odds(x, y))
 
 
 @bare_kernel
@@ -144,7 +150,7 @@ def test_integers_equal_numpy(dtype):
     info = np.iinfo(dtype)
     a, b = rng.integers(info.min, info.max, (2, 40), dtype, endpoint=True)
     b[::3] = a[::3]
-    out = np.zeros((6, LANES), dtype)
+    out = np.zeros((9, LANES), dtype)
     integers(a, b, 2, out)
     x, y = a[2 : 2 + LANES], b[2 : 2 + LANES]
     rows = [
@@ -154,6 +160,9 @@ def test_integers_equal_numpy(dtype):
         np.concatenate([x[-1:], y[:-1]]),
         np.minimum(x, y),
         np.where(x == y, x, y[0]),
+        x << 3,
+        np.concatenate([x[0::2], y[0::2]]),
+        np.concatenate([x[1::2], y[1::2]]),
     ]
     np.testing.assert_array_equal(out, rows)
 

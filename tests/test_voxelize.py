@@ -301,7 +301,7 @@ def test_shares_merge_to_the_whole_and_tell_the_occupied_box(counting):
     size = math.prod(lattice.shape)
     box, grids = new_box(), [np.zeros(size, np.uint32 if counting else np.uint8) for _ in range(2)]
     marking = Marking.of(width)
-    common = (lattice.limits(), lattice.shape, 1, counting)
+    common = (lattice.limits(), lattice.bits, lattice.shape, 1, counting)
     for cells, points, rows in (
         (grids[0], cloud.points[:617], (0, 5)),
         (grids[1], cloud.points[617:], (5, height)),
@@ -327,7 +327,16 @@ def test_nothing_in_range_leaves_the_box_empty():
     points, cells = np.full((5, 3), 99.0, np.float32), np.zeros(math.prod(lattice.shape), np.uint8)
     T = part_transform(Cloud("c", points), lattice)
     mark_points(
-        points, T, lattice.limits(), lattice.shape, 1, False, *Marking.of(32).for_points(), box, cells
+        points,
+        T,
+        lattice.limits(),
+        lattice.bits,
+        lattice.shape,
+        1,
+        False,
+        *Marking.of(32).for_points(),
+        box,
+        cells,
     )
     assert box.tolist() == new_box().tolist()
     assert not cells.any()

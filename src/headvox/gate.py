@@ -18,19 +18,28 @@ from headvox.kernels import bare_kernel, rule
 from headvox.simd import LANES, add, fill, less, load, lowest, sub, times, within
 
 SLICES = 4
-EVEN, ALL = np.uint32(0x55555555), np.uint32(0xFFFFFFFF)
+ALL = np.uint32(0xFFFFFFFF)
 
 
 @rule
 def box_sums_at(flat, at, corners, b):  # type: ignore[no-untyped-def]
-    """Return the sums over box ``b`` about :data:`LANES` voxels, one above the other."""
-    high = sub(load(flat, at + corners[b, 0]), load(flat, at + corners[b, 1]))
-    high = sub(high, sub(load(flat, at + corners[b, 2]), load(flat, at + corners[b, 3])))
-    low = sub(load(flat, at + corners[b, 4]), load(flat, at + corners[b, 5]))
-    return sub(high, sub(low, sub(load(flat, at + corners[b, 6]), load(flat, at + corners[b, 7]))))
+    """Return the sums over box ``b`` about :data:`LANES` voxels, each two above the one before.
+
+    ``at`` tells the first, see :func:`headvox.integral.set_corners`.
+    """
+    low = at[0] + corners[b, 4] + (corners[b, 5] & at[1])
+    high = at[0] + corners[b, 6] + (corners[b, 7] & at[1])
+    c0, c1, c2, c3 = corners[b, 0], corners[b, 1], corners[b, 2], corners[b, 3]
+    one = sub(
+        sub(load(flat, high + c0), load(flat, low + c0)), sub(load(flat, high + c1), load(flat, low + c1))
+    )
+    other = sub(
+        sub(load(flat, high + c2), load(flat, low + c2)), sub(load(flat, high + c3), load(flat, low + c3))
+    )
+    return sub(one, other)
 
 
-@bare_kernel
+@rule
 def holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[no-untyped-def]
     """Return a bit for each of :data:`LANES` voxels: whether condition ``i``'s statistic lies within its limits."""
     # Unsigned, because a signed index costs a check for counting from the end.
@@ -54,35 +63,44 @@ def holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[n
 def gate_columns(  # type: ignore[no-untyped-def]
     S, region, part, parts, weights, spans, rank, limits, spacing, odd, corners, passed
 ):
-    """Write to ``passed`` (nx, ny, vectors a column) a bit for each voxel of ``region``: whether it passes.
+    """Write to ``passed`` (nx, ny, words a column) a bit for each voxel of ``region``: whether it passes.
 
-    ``region`` is x0 x1 y0 y1 z0 z1; S has margins about it, see :func:`headvox.integral.shape_with_margins`. With
-    ``odd`` (3,) added to x, y and z, all voxels count (``spacing`` 1), those whose x + y + z is even (2), or those
-    whose x, y and z are all even or all odd (4). ``corners`` are those of the gate's boxes. Of ``parts`` shares of the
-    slices, the ``part``-th is done.
+    The bits of a word are for every other voxel, from 64 k on in word 2 k of a column, from 64 k + 1 on in the next.
+    ``region`` is x0 x1 y0 y1 z0 z1; S, in halves, has margins about it, see
+    :func:`headvox.integral.shape_with_margins`. With ``odd`` (3,) added to x, y and z, all voxels count (``spacing``
+    1), those whose x + y + z is even (2), or those whose x, y and z are all even or all odd (4). ``corners`` are those
+    of the gate's boxes. Of ``parts`` shares of the slices, the ``part``-th is done.
     """
     flat = S.reshape(-1)
-    x0, x1, y0, y1 = region[0], region[1], region[2], region[3]
-    bottom, height = region[4], region[5] - region[4]
+    x0, y0, bottom, height = region[0], region[2], region[4], region[5] - region[4]
+    odd_column, odd_z = odd[0] + odd[1], (odd[0] if spacing == 4 else odd[0] + odd[1]) + odd[2] + bottom
     # A few slices go side by side, because they share most of what their boxes look up.
-    for block in range(x0 + SLICES * part, x1, SLICES * parts):
-        for y in range(y0, y1):
-            for x in range(block, min(block + SLICES, x1)):
-                column = (x * S.shape[1] + y) * S.shape[2] + bottom
-                across = x + y + odd[0] + odd[1]
-                up = (across if spacing == 2 else x + odd[0]) + bottom + odd[2]
-                for k in range(passed.shape[2]):
-                    z = LANES * k
-                    alive = ALL if z + LANES <= height else ALL >> np.uint32(z + LANES - height)
-                    if spacing > 1:
-                        alive &= EVEN << np.uint32(up & 1)
-                    if spacing == 4 and across & 1:
-                        alive = np.uint32(0)
-                    for i in range(np.uint64(rank.shape[0])):
-                        if alive == 0:
-                            break
-                        alive &= holds(flat, column + z, corners, weights, spans, rank, limits, i)
-                    passed[x - x0, y - y0, k] = alive
+    for block in range(x0 + SLICES * part, region[1], SLICES * parts):
+        for y in range(y0, region[3]):
+            for x in range(block, min(block + SLICES, region[1])):
+                column = (x * S.shape[1] + y) * S.shape[2]
+                words = passed[np.uint64(x - x0), np.uint64(y - y0)]
+                first, after = 0, 2  # the words of a pair that have candidates
+                if spacing > 1:
+                    first = ((x if spacing == 4 else x + y) + odd_z) & 1
+                    after = first if spacing == 4 and (x + y + odd_column) & 1 else first + 1
+                for pair in range(0, words.shape[0], 2):
+                    words[np.uint64(pair)] = words[np.uint64(pair + 1)] = 0
+                    for k in range(first, after):
+                        z = LANES * pair + k
+                        alive = lowest_bits((height - z + 1) // 2)
+                        for i in range(np.uint64(rank.shape[0])):
+                            if alive == 0:
+                                break
+                            at = column + ((bottom + z) >> 1), -((bottom + z) & 1)
+                            alive &= holds(flat, at, corners, weights, spans, rank, limits, i)
+                        words[np.uint64(pair + k)] = alive
+
+
+@rule
+def lowest_bits(count):  # type: ignore[no-untyped-def]
+    """Return the ``count`` lowest bits set, or as many as there are, or none."""
+    return ALL >> np.uint32(LANES - count) if 0 < count < LANES else (ALL if count > 0 else np.uint32(0))
 
 
 @bare_kernel
@@ -94,15 +112,19 @@ def list_passed(passed, region, survivors):  # type: ignore[no-untyped-def]
     found = 0
     for x in range(passed.shape[0]):
         for y in range(passed.shape[1]):
-            for k in range(passed.shape[2]):
-                bits = passed[x, y, k]
+            for k in range(0, passed.shape[2], 2):
+                evens, odds = passed[x, y, k], passed[x, y, k + 1]
+                bits = evens | odds
                 while bits:
-                    if found < survivors.shape[0]:
-                        survivors[found, 0] = region[0] + x
-                        survivors[found, 1] = region[2] + y
-                        survivors[found, 2] = region[4] + LANES * k + lowest(bits)
+                    lane = lowest(bits)
                     bits &= bits - np.uint32(1)
-                    found += 1
+                    for j in range(2):
+                        if (odds if j else evens) >> np.uint32(lane) & np.uint32(1):
+                            if found < survivors.shape[0]:
+                                survivors[found, 0] = region[0] + x
+                                survivors[found, 1] = region[2] + y
+                                survivors[found, 2] = region[4] + LANES * k + 2 * lane + j
+                            found += 1
     return found
 
 
@@ -142,7 +164,7 @@ def gate_tables(gate: CompiledGate, sum_type: np.dtype[Any]) -> tuple[npt.NDArra
 def shape_of_passed(region: npt.NDArray[np.int64]) -> tuple[int, int, int]:
     """Return the shape of the bits of ``region``, see :func:`gate_columns`."""
     nx, ny, nz = (region[1::2] - region[0::2]).tolist()
-    return nx, ny, -(-nz // LANES)
+    return nx, ny, 2 * -(-nz // (2 * LANES))
 
 
 def pass_gate(S: Integral, gate: CompiledGate, odd: npt.ArrayLike = (0, 0, 0)) -> npt.NDArray[np.int32]:
@@ -154,10 +176,11 @@ def pass_gate(S: Integral, gate: CompiledGate, odd: npt.ArrayLike = (0, 0, 0)) -
     low = -reach[0::2]
     region = np.stack([low, low + S.shape - 1], axis=1).reshape(-1)
     longer = with_margins(S, reach)
-    corners, passed = np.empty((len(gate.boxes), 8), np.uint64), np.empty(shape_of_passed(region), np.uint32)
+    corners, passed = np.empty((len(gate.boxes), 8), np.int64), np.empty(shape_of_passed(region), np.uint32)
     set_corners(longer, gate.boxes, corners)
     tables = gate_tables(gate, S.dtype)
-    gate_columns(longer, region, 0, 1, *tables, gate.spacing, np.asarray(odd) + low, corners, passed)
+    at = gate.spacing, np.asarray(odd) + low
+    gate_columns(longer, region, 0, 1, *tables, *at, corners, passed)
     survivors = np.empty((sum(int(bits).bit_count() for bits in passed[passed > 0]), 3), np.int32)
     list_passed(passed, region, survivors)
     return survivors - low.astype(np.int32)

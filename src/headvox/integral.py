@@ -7,6 +7,9 @@ S[x, y, z] is the sum of the grid over all cells below x, y and z, so the sum ov
 
 (Viola and Jones's summed-area table in 3-D). S is unsigned and wraps around: every box sum that fits the type is
 exact all the same, because the wraps cancel. So S can be half the size, and faster, than its largest entry asks for.
+
+Where S is searched, its columns are *in halves*: first S at all even z, then at all odd z (:func:`place`). A gate that
+looks at every other voxel then finds the corners of a vector full of them next to each other.
 """
 
 from __future__ import annotations
@@ -17,19 +20,38 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.kernels import bare_kernel, kernel, rule
-from headvox.simd import LANES, add, beginning, bit_counts, last, load, running_sums, store, sub, widen
+from headvox.simd import (
+    LANES,
+    add,
+    beginning,
+    bit_counts,
+    evens,
+    last,
+    load,
+    odds,
+    running_sums,
+    store,
+    sub,
+    widen,
+)
 
 Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
 
 
+@rule
+def place(z, half):  # type: ignore[no-untyped-def]
+    """Return where z lies in a column in halves, each ``half`` as long: first the even ones, then the odd ones."""
+    return (z >> 1) + (z & 1) * half
+
+
 @bare_kernel
 def integrate(cells, box, first, counting, y_first, y_last, spare, row, S):  # type: ignore[no-untyped-def]
-    """Fill the columns ``y_first`` to ``y_last`` of ``S`` with the integral volume of the cells in ``box``.
+    """Fill the columns ``y_first`` to ``y_last`` of ``S`` with the integral volume of the cells in ``box``, in halves.
 
     ``box`` is lowest and highest cell (inclusive); what lies outside of it counts as empty. S[0, 0, 0] is at the lower
-    corner of the cell ``first``, which may lie before the grid, and S may go on behind it; it is a whole number of
-    vectors high. A parts grid is summed by its bits. ``spare`` (LANES cells) and ``row`` (LANES more than S is high)
-    are working memory.
+    corner of the cell ``first``, which may lie before the grid, and S may go on behind it: see
+    :func:`shape_with_margins` for its shape, and :func:`place` for the order of a column. A parts grid is summed by its
+    bits. ``spare`` (LANES cells) and ``row`` (LANES more than S is high) are working memory.
     """
     flat, grid = S.reshape(-1), cells.reshape(-1)
     columns, length = S.shape[1], S.shape[2]
@@ -53,25 +75,45 @@ def integrate(cells, box, first, counting, y_first, y_last, spare, row, S):  # t
                     store(flat, after + z, add(load(flat, before + z), load(row, z)))
 
 
-@bare_kernel
+@rule
 def _add_column(grid, at, height, counting, spare, row, bottom):  # type: ignore[no-untyped-def]
     """Add to ``row``, from ``bottom`` on, what is in the column that begins at ``at``, up to each of its cells."""
+    half = (row.shape[0] - LANES) // 2
+    lower, upper = place(bottom, half), place(bottom + 1, half)  # of the first two cells
+    lower_end = half if lower < half else 2 * half
+    upper_end = 3 * half - lower_end
     total = load(row, 0)
     total = sub(total, total)
-    for z in range(0, height, LANES):
-        if at + z + LANES <= grid.shape[0]:
-            cells = load(grid, at + z)
-        else:
-            for k in range(min(height - z, LANES)):
-                spare[k] = grid[at + z + k]
-            cells = load(spare, 0)
-        cells = beginning(cells, height - z)
-        amounts = cells if counting else bit_counts(cells)
-        sums = add(running_sums(widen(amounts, total)), total)
-        store(row, bottom + z, add(load(row, bottom + z), sums))
+    for z in range(0, height, 2 * LANES):
+        some, more = (
+            _amounts(grid, at, z, height, counting, spare),
+            _amounts(grid, at, z + LANES, height, counting, spare),
+        )
+        second = widen(odds(some, more), total)
+        sums = add(running_sums(add(widen(evens(some, more), total), second)), total)
+        k = z // 2
+        before = beginning(sub(sums, second), lower_end - lower - k)
+        store(row, lower + k, add(load(row, lower + k), before))
+        store(row, upper + k, add(load(row, upper + k), beginning(sums, upper_end - upper - k)))
         total = last(sums)
-    for z in range(bottom + (height + LANES - 1) // LANES * LANES, row.shape[0] - LANES, LANES):
-        store(row, z, add(load(row, z), total))
+    done = (height + 2 * LANES - 1) // (2 * LANES) * LANES
+    for k in range(lower + done, lower_end, LANES):
+        store(row, k, add(load(row, k), beginning(total, lower_end - k)))
+    for k in range(upper + done, upper_end, LANES):
+        store(row, k, add(load(row, k), beginning(total, upper_end - k)))
+
+
+@rule
+def _amounts(grid, at, z, height, counting, spare):  # type: ignore[no-untyped-def]
+    """Return what the cells ``z`` to ``z + LANES`` of a column hold, 0 from ``height`` on."""
+    if at + z + LANES <= grid.shape[0]:
+        cells = load(grid, at + z)
+    else:
+        for k in range(min(height - z, LANES)):
+            spare[k] = grid[at + z + k]
+        cells = load(spare, 0)
+    cells = beginning(cells, height - z)
+    return cells if counting else bit_counts(cells)
 
 
 @rule
@@ -86,21 +128,30 @@ def box_sum(S, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
     return high - low
 
 
+@rule
+def sum_about(S, x, y, z, box):  # type: ignore[no-untyped-def]
+    """Return the exact sum over ``box`` about the voxel x, y, z as a signed number."""
+    value = box_sum(S, x + box[0], x + box[1], y + box[2], y + box[3], z + box[4], z + box[5])
+    mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
+    return np.int64(value) & mask
+
+
 @bare_kernel
 def set_corners(S, boxes, corners):  # type: ignore[no-untyped-def]
-    """Write where the corners of ``boxes`` (B, 6) lie in the flat S, from the voxel that they are about, to (B, 8).
+    """Write where the corners of ``boxes`` (B, 6) lie in the flat S, which is in halves, to (B, 8).
 
-    A box's sum is ((0 - 1) - (2 - 3)) - ((4 - 5) - (6 - 7)).
+    First where the columns x1 y1, x0 y1, x1 y0 and x0 y0 begin, from that of the voxel that a box is about. Then where
+    z0 lies in them, from half the voxel's z, if that is even, and what to add if it is odd; likewise z1. So a voxel is
+    told by where its column begins plus half its z, and by -1 if its z is odd, else 0.
     """
-    along_x, along_y = S.shape[1] * S.shape[2], S.shape[2]
+    along_x, along_y, half = S.shape[1] * S.shape[2], S.shape[2], S.shape[2] // 2
     for b in range(boxes.shape[0]):
         x0, x1 = boxes[b, 0] * along_x, boxes[b, 1] * along_x
         y0, y1 = boxes[b, 2] * along_y, boxes[b, 3] * along_y
-        z0, z1 = boxes[b, 4], boxes[b, 5]
-        corners[b, 0], corners[b, 1] = x1 + y1 + z1, x1 + y1 + z0
-        corners[b, 2], corners[b, 3] = x0 + y1 + z1, x0 + y1 + z0
-        corners[b, 4], corners[b, 5] = x1 + y0 + z1, x1 + y0 + z0
-        corners[b, 6], corners[b, 7] = x0 + y0 + z1, x0 + y0 + z0
+        corners[b, 0], corners[b, 1], corners[b, 2], corners[b, 3] = x1 + y1, x0 + y1, x1 + y0, x0 + y0
+        for k in range(2):
+            z = boxes[b, 4 + k]
+            corners[b, 4 + 2 * k], corners[b, 5 + 2 * k] = place(z, half), place(z + 1, half) - place(z, half)
 
 
 def integral_volume(cells: npt.NDArray[Any], narrow: bool = False) -> Integral:
@@ -113,7 +164,20 @@ def integral_volume(cells: npt.NDArray[Any], narrow: bool = False) -> Integral:
     box = np.array([0, 0, 0, nx - 1, ny - 1, nz - 1], dtype=np.int64)
     memory = np.zeros(LANES, cells.dtype), np.zeros(S.shape[2] + LANES, S.dtype)
     integrate(cells, box, np.zeros(3, np.int64), cells.dtype != np.uint8, 0, ny + 1, *memory, S)
-    return np.ascontiguousarray(S[:, :, : nz + 1])
+    return in_order(S)[:, :, : nz + 1].copy()
+
+
+def in_order(S: Integral) -> Integral:
+    """Return a copy of ``S``, whose columns are in halves (see :func:`place`), with columns in the order of z."""
+    half = S.shape[2] // 2
+    whole: npt.NDArray[Any] = np.empty_like(S)
+    whole[:, :, 0::2], whole[:, :, 1::2] = S[:, :, :half], S[:, :, half:]
+    return whole
+
+
+def in_halves(S: Integral) -> Integral:
+    """Return a copy of ``S``, whose columns are in the order of z and of even length, with columns in halves."""
+    return np.concatenate([S[:, :, 0::2], S[:, :, 1::2]], axis=2)
 
 
 @kernel
@@ -137,22 +201,22 @@ def box_reach(boxes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
     return np.stack([low, high], axis=1).reshape(-1).astype(np.int64)
 
 
-def _rounded_up(height: int) -> int:
-    """Return the least whole number of vectors that holds ``height`` voxels."""
-    return -(-height // LANES) * LANES
+def _rounded_up(height: int, to: int = LANES) -> int:
+    """Return the least multiple of ``to`` that holds ``height`` voxels."""
+    return -(-height // to) * to
 
 
 def shape_with_margins(shape: tuple[int, ...], reach: npt.NDArray[np.int64]) -> tuple[int, int, int]:
     """Return the shape of an integral volume in which boxes that ``reach`` so far about ``shape`` voxels lie.
 
-    The voxels begin at -reach[0], -reach[2], -reach[4]. A column is as high as whole vectors of voxels ask for.
+    The voxels begin at -reach[0], -reach[2], -reach[4]. A column is as high as pairs of vectors of voxels ask for.
     """
     x0, x1, y0, y1, z0, z1 = reach.tolist()
-    return shape[0] + x1 - x0, shape[1] + y1 - y0, _rounded_up(_rounded_up(shape[2]) + z1 - z0)
+    return shape[0] + x1 - x0, shape[1] + y1 - y0, _rounded_up(_rounded_up(shape[2], 2 * LANES) + z1 - z0)
 
 
 def with_margins(S: Integral, reach: npt.NDArray[np.int64]) -> Integral:
-    """Return a copy of ``S`` that goes on over empty cells, so that boxes about its voxels may ``reach`` so far."""
+    """Return a copy of ``S`` in halves that goes on over empty cells: boxes about its voxels may ``reach`` so far."""
     low, shape = -reach[0::2], shape_with_margins(tuple(n - 1 for n in S.shape), reach)
     longer: npt.NDArray[Any] = np.pad(
         S, [(a, n - m - a) for a, n, m in zip(low, shape, S.shape, strict=True)], mode="edge"
@@ -160,4 +224,4 @@ def with_margins(S: Integral, reach: npt.NDArray[np.int64]) -> Integral:
     longer[: low[0]] = 0
     longer[:, : low[1]] = 0
     longer[:, :, : low[2]] = 0
-    return longer
+    return in_halves(longer)

@@ -49,7 +49,7 @@ class Memory:
         self.first = np.zeros(3, np.int64)
         """The cell that the integral volume begins at."""
         self.gate = gate_tables(cascade.gate, self.S.dtype)
-        self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.uint64)
+        self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.int64)
         self.candidate_reach = candidate_reach(cascade.gate)
         whole = np.array([0, lattice.shape[0], 0, lattice.shape[1], 0, lattice.shape[2]])
         self.passed = np.empty(math.prod(shape_of_passed(whole)), np.uint32)
@@ -107,7 +107,7 @@ class Stages:
     compiled: CompiledStages
     tables: tuple[npt.NDArray[Any], ...]
     memory: list[tuple[npt.NDArray[Any], ...]]
-    corners: npt.NDArray[np.uint64]
+    corners: I64
     offsets: I32
     offset_start: I32
 
@@ -118,5 +118,5 @@ class Stages:
         boxes, _ = seen_boxes(compiled)
         memory = [stages.memory() for _ in range(threads)]
         return cls(
-            compiled, stages.tables, memory, np.empty((len(compiled.boxes), 8), np.uint64), *cells_of(boxes)
+            compiled, stages.tables, memory, np.empty((len(compiled.boxes), 8), np.int64), *cells_of(boxes)
         )

@@ -204,6 +204,7 @@ class Detector:
                     points[low:high],
                     T,
                     limits,
+                    lattice.bits,
                     shape,
                     shift,
                     counting,
@@ -215,7 +216,7 @@ class Detector:
                 rays, depth = self._placing.rays(image, lattice), read_only(image.depth)
                 low, high = _share(depth.shape[0], part, parts)
                 mark_depth(
-                    depth, low, high, rays.column, rays.row, rays.t, limits, shape, shift, counting,
+                    depth, low, high, rays.column, rays.row, rays.t, limits, lattice.bits, shape, shift, counting,
                     *marking.for_depth(depth.shape[1]), box, cells,
                 )  # fmt: skip
 

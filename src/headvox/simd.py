@@ -133,6 +133,16 @@ def shift_right(typingctx, a, count):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def shift_left(typingctx, a, count):  # type: ignore[no-untyped-def]
+    """Return a << count, lane by lane."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.shl(arguments[0], _spread(builder, arguments[1]))
+
+    return a(a, a.scalar), emit
+
+
+@intrinsic
 def to_float(typingctx, a):  # type: ignore[no-untyped-def]
     """Return unsigned integers as float32."""
     lanes = Lanes(types.float32)
@@ -198,6 +208,18 @@ def shifted(typingctx, before, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def evens(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return lanes 0, 2, 4, ... of ``a``, then those of ``b``."""
+    return _every_second(a, b, 0)
+
+
+@intrinsic
+def odds(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return lanes 1, 3, 5, ... of ``a``, then those of ``b``."""
+    return _every_second(a, b, 1)
+
+
+@intrinsic
 def smaller(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return the smaller of a and b as signed numbers, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.select(builder.icmp_signed("<", x, y), x, y))
@@ -226,8 +248,11 @@ def beginning(typingctx, a, count):  # type: ignore[no-untyped-def]
 
     def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         x, number = arguments
-        lane = ir.Constant(_vector(64), list(range(LANES)))
-        keep = builder.icmp_signed("<", lane, _spread(builder, number))
+        least, most = (ir.Constant(number.type, n) for n in (0, LANES))
+        number = builder.select(builder.icmp_signed("<", number, least), least, number)
+        number = builder.select(builder.icmp_signed(">", number, most), most, number)
+        lane = ir.Constant(_vector(8), list(range(LANES)))
+        keep = builder.icmp_signed("<", lane, _spread(builder, builder.trunc(number, ir.IntType(8))))
         return builder.select(keep, x, ir.Constant(x.type, None))
 
     return a(a, types.int64), emit
@@ -371,6 +396,11 @@ def _two(a: Any, b: Any, on_integers: Any, on_reals: Any = None) -> Any:
         return instruction(builder, *arguments)
 
     return (a(a, b), emit) if a == b else None
+
+
+def _every_second(a: Any, b: Any, first: int) -> Any:
+    places = list(range(first, 2 * LANES, 2))
+    return _two(a, b, lambda builder, x, y: builder.shuffle_vector(x, y, ir.Constant(_vector(32), places)))
 
 
 def _vector(bits: int) -> Any:

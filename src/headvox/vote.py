@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.compile_masks import SCORE_UNIT, CompiledStages, CompiledVotes
-from headvox.integral import Integral, box_reach, box_sum, set_corners, with_margins
+from headvox.integral import Integral, box_reach, place, set_corners, with_margins
 from headvox.kernels import bare_kernel, kernel, product, rule
 from headvox.masks import STATISTICS
 from headvox.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
@@ -31,11 +31,16 @@ F64 = npt.NDArray[np.float64]
 
 
 @rule
-def sum_about(S, x, y, z, box):  # type: ignore[no-untyped-def]
-    """Return the exact sum over ``box`` about the voxel x, y, z as a signed number."""
-    value = box_sum(S, x + box[0], x + box[1], y + box[2], y + box[3], z + box[4], z + box[5])
+def sum_in_halves(S, x, y, z, box):  # type: ignore[no-untyped-def]
+    """Return the exact sum over ``box`` about the voxel x, y, z as a signed number; S is in halves."""
+    nx, ny, nz, half = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1, S.shape[2] // 2
+    x0, x1 = min(max(x + box[0], 0), nx), min(max(x + box[1], 0), nx)
+    y0, y1 = min(max(y + box[2], 0), ny), min(max(y + box[3], 0), ny)
+    z0, z1 = place(min(max(z + box[4], 0), nz), half), place(min(max(z + box[5], 0), nz), half)
+    high = S[x1, y1, z1] - S[x0, y1, z1] - S[x1, y0, z1] + S[x0, y0, z1]
+    low = S[x1, y1, z0] - S[x0, y1, z0] - S[x1, y0, z0] + S[x0, y0, z0]
     mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
-    return np.int64(value) & mask
+    return np.int64(high - low) & mask
 
 
 # ------------------------------------------------------------------------------------------------ the paper's
@@ -52,7 +57,7 @@ def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes): 
         for m in range(yaw * masks, (yaw + 1) * masks):
             total = np.int64(0)
             for b in range(start[m], start[m + 1]):
-                total += weights[b] * sum_about(S, x, y, z, boxes[b])
+                total += weights[b] * sum_in_halves(S, x, y, z, boxes[b])
             if total > 0:
                 votes += 1
                 score += 1.0
@@ -60,8 +65,8 @@ def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes): 
                 score -= 1.0
         unlike = 0.0
         for p in range(pairs.shape[1]):
-            one = sum_about(S, x, y, z, pairs[yaw, p, 0])
-            other = sum_about(S, x, y, z, pairs[yaw, p, 1])
+            one = sum_in_halves(S, x, y, z, pairs[yaw, p, 0])
+            other = sum_in_halves(S, x, y, z, pairs[yaw, p, 1])
             if one + other > 0:
                 unlike += abs(one - other) / (one + other)
         if pairs.shape[1] > 0:
@@ -99,6 +104,8 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
         votes.asymmetry_cost,
         votes.min_votes,
     )
+    reach = box_reach(np.concatenate([votes.boxes, votes.pairs.reshape(-1, 6)]))
+    S, cells = with_margins(S, reach), cells - reach[0::2].astype(np.int32)
     vote_masks(S, cells, 0, len(cells), *table, scores, best_yaw)
     return scores, best_yaw
 
@@ -163,35 +170,40 @@ def _add_trees(first, last, leaf_start, leaves, node_start, nodes, cuts, feature
 
 
 @bare_kernel
-def _look_up(flat, at, width, corners, first, count, sums):  # type: ignore[no-untyped-def]
-    """Write the sums over ``count`` boxes from ``first`` on to as many rows of ``sums``, a lane a candidate."""
+def _look_up(flat, at, is_odd, width, corners, first, count, sums):  # type: ignore[no-untyped-def]
+    """Write the sums over ``count`` boxes from ``first`` on to as many rows of ``sums``, a lane a candidate.
+
+    ``at`` and ``is_odd`` say where a candidate is: see :func:`headvox.integral.set_corners`.
+    """
     mask = 0xFFFF if flat.itemsize == 2 else 0xFFFFFFFF
     # Unsigned, because a signed index costs a check for counting from the end.
     for k in range(np.uint64(count)):
         row, b = k * np.uint64(LANES), np.uint64(first) + k
         c0, c1, c2, c3 = corners[b, 0], corners[b, 1], corners[b, 2], corners[b, 3]
-        c4, c5, c6, c7 = corners[b, 4], corners[b, 5], corners[b, 6], corners[b, 7]
+        z0, z0_if_odd, z1, z1_if_odd = corners[b, 4], corners[b, 5], corners[b, 6], corners[b, 7]
         for lane in range(np.uint64(width)):
-            voxel = at[lane]
-            high = np.int64(flat[voxel + c0]) - np.int64(flat[voxel + c1])
-            high -= np.int64(flat[voxel + c2]) - np.int64(flat[voxel + c3])
-            low = np.int64(flat[voxel + c4]) - np.int64(flat[voxel + c5])
-            low -= np.int64(flat[voxel + c6]) - np.int64(flat[voxel + c7])
-            sums[row + lane] = (high - low) & mask
+            low = at[lane] + z0 + (z0_if_odd & is_odd[lane])
+            high = at[lane] + z1 + (z1_if_odd & is_odd[lane])
+            one = np.int64(flat[np.uint64(high + c0)]) - np.int64(flat[np.uint64(low + c0)])
+            one -= np.int64(flat[np.uint64(high + c1)]) - np.int64(flat[np.uint64(low + c1)])
+            other = np.int64(flat[np.uint64(high + c2)]) - np.int64(flat[np.uint64(low + c2)])
+            other -= np.int64(flat[np.uint64(high + c3)]) - np.int64(flat[np.uint64(low + c3)])
+            sums[row + lane] = (one - other) & mask
 
 
 @bare_kernel
 def vote_stages(  # type: ignore[no-untyped-def]
     S, cells, seen, first, last, to_stage, group_start, group_channel, seen_start, used_start, used,
-    leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, sums, features, values,
-    total, scores,
+    leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, is_odd, sums, features,
+    values, total, scores,
 ):  # fmt: skip
     """Write the sum of the trees of the first ``to_stage`` stages to ``scores``; DROPPED where a stage says so.
 
     Each stage takes the candidates that are left, LANES at a time: it looks up the groups its trees ask for, and adds
     its trees up. ``seen`` (candidates, boxes of other channels, 2) holds how many cells of a box are known-empty and
-    hidden. No box may leave S; ``corners`` are those of the boxes. ``alive`` (candidates,), ``at`` (LANES,) and the
-    rows of LANES numbers ``sums``, ``features``, ``values`` and ``total`` are working memory.
+    hidden. No box may leave S, which is in halves; ``corners`` are those of the boxes. ``alive`` (candidates,), ``at``
+    and ``is_odd`` (LANES,) and the rows of LANES numbers ``sums``, ``features``, ``values`` and ``total`` are working
+    memory.
     """
     flat, end = S.reshape(-1), last
     for i in range(first, last):
@@ -203,7 +215,8 @@ def vote_stages(  # type: ignore[no-untyped-def]
             width = min(LANES, end - begin)
             for lane in range(width):
                 i = alive[begin + lane]
-                at[lane] = (cells[i, 0] * S.shape[1] + cells[i, 1]) * S.shape[2] + cells[i, 2]
+                column = (cells[i, 0] * S.shape[1] + cells[i, 1]) * S.shape[2]
+                at[lane], is_odd[lane] = column + (cells[i, 2] >> 1), -(cells[i, 2] & 1)
             for u in range(used_start[s], used_start[s + 1]):
                 g, ranked = used[u, 0], used[u, 1]
                 count, channel = group_start[g + 1] - group_start[g], group_channel[g]
@@ -212,7 +225,7 @@ def vote_stages(  # type: ignore[no-untyped-def]
                         for lane in range(width):
                             sums[LANES * k + lane] = seen[alive[begin + lane], seen_start[g] + k, channel - 1]
                 else:
-                    _look_up(flat, at, width, corners, group_start[g], count, sums)
+                    _look_up(flat, at, is_odd, width, corners, group_start[g], count, sums)
                 statistics_of(sums, count, ranked, features, FEATURES_PER_GROUP * LANES * g)
             _add_trees(
                 stage_trees[s], stage_trees[s + 1], leaf_start, leaves, node_start, nodes, cuts, features, values, total
@@ -292,7 +305,7 @@ class StageTables:
     def memory(self) -> tuple[npt.NDArray[Any], ...]:
         """Return the working memory of one thread."""
         rows = [np.zeros(LANES * count, self.number) for count in (*self.sizes, 1)]
-        return (np.zeros(LANES, np.uint64), *rows)
+        return (np.zeros(LANES, np.int64), np.zeros(LANES, np.int64), *rows)
 
 
 def _starts(of: I64, count: int) -> I64:
@@ -319,7 +332,7 @@ def score_by_stages(S: Integral, cells: I32, stages: CompiledStages, seen: I32 |
     tables = StageTables.of(stages, S.dtype)
     reach = box_reach(stages.boxes)
     S, cells = with_margins(S, reach), cells - reach[0::2].astype(np.int32)
-    corners = np.empty((len(stages.boxes), 8), np.uint64)
+    corners = np.empty((len(stages.boxes), 8), np.int64)
     set_corners(S, stages.boxes, corners)
     scores, alive = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
     vote_stages(

@@ -33,6 +33,7 @@ from headvox.simd import (
     load,
     load_triples,
     mul,
+    shift_left,
     shift_right,
     shifted,
     smaller,
@@ -47,8 +48,9 @@ from headvox.simd import (
 NOWHERE = np.int32(-1)
 FARTHEST = np.int32(2**31 - 1)
 MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
+MOST_BITS = 32  # and so do a part's x, y and z side by side
 ALL = np.uint32(0xFFFFFFFF)
-MOST_NEW = 1024  # codes that are entered at a time
+MOST_NEW = 4096  # codes that are entered at a time
 
 Cells = npt.NDArray[np.uint8] | npt.NDArray[np.uint32]
 
@@ -81,9 +83,10 @@ class Lattice:
         # limit may round onto it.
         nx = ny = math.ceil(2 * radius / voxel_m) + 2
         nz = math.ceil((region.max_height_m - region.min_height_m) / voxel_m) + 2
-        if nx * ny * nz > MOST_CELLS:
+        bits = sum((n * subdivision - 1).bit_length() for n in (nx, ny, nz))
+        if nx * ny * nz > MOST_CELLS or bits > MOST_BITS:
             raise HeadvoxError(
-                f"The region has {nx} x {ny} x {nz} voxels of {voxel_m:g} m: more than {MOST_CELLS} are not searched.",
+                f"The region has {nx} x {ny} x {nz} voxels of {voxel_m:g} m: more than can be numbered.",
                 "Set a smaller max_range_m, less height, or larger voxels.",
             )
         return cls((ox, oy, oz), voxel_m, (nx, ny, nz), subdivision, region)
@@ -92,6 +95,11 @@ class Lattice:
     def part_m(self) -> float:
         """Edge of the smallest thing the grid can tell apart."""
         return self.voxel_m / self.subdivision
+
+    @property
+    def bits(self) -> npt.NDArray[np.int32]:
+        """How many bits number the parts along y and along z: (2,). A part is packed as x, y, z into one number."""
+        return np.array([(n * self.subdivision - 1).bit_length() for n in self.shape[1:]], np.int32)
 
     @property
     def odd(self) -> I64:
@@ -155,75 +163,78 @@ def code_of(x, y, z, ny, nz, shift):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _mark(x, y, z, known, left, codes, at, limits, shape, shift, counting, extremes, new, count):  # type: ignore[no-untyped-def]
-    """Write the codes of LANES places, in parts from the origin, to ``new`` from ``count`` on.
+def _mark(x, y, z, known, left, codes, at, limits, bits, counting, new, count):  # type: ignore[no-untyped-def]
+    """Write the packed parts of LANES places, in parts from the origin, to ``new`` from ``count`` on.
 
-    Left out are places whose bit in ``known`` is not set, and such as repeat others. ``left`` are the codes of the
+    Left out are places whose bit in ``known`` is not set, and such as repeat others. ``left`` are the parts of the
     LANES places before, and ``codes`` from ``at`` on are others that may be repeated: neighbours mostly fall into one
-    part, and a part has to be entered but once. ``codes`` is overwritten. Return the codes; ``extremes`` widened by
-    the cells: the lowest and the highest in x, y and z, a vector each; and the new count.
+    part, and a part has to be entered but once. ``codes`` is overwritten. Return the parts and the new count.
     """
     within = known & inside(x, y, z, limits)
     mine = fill(NOWHERE)
     if within:
-        x, y, z = to_int(x), to_int(y), to_int(z)
-        mine = where(within, code_of(x, y, z, shape[1], shape[2], shift), mine)
+        mine = where(within, packed(to_int(x), to_int(y), to_int(z), bits), mine)
         if not counting:
             above = equal(mine, load(codes, at)) | equal(mine, load(codes, at + 1))
             within &= ~(above | equal(mine, shifted(left, mine)))
-        extremes = _widened(
-            extremes, within, shift_right(x, shift), shift_right(y, shift), shift_right(z, shift)
-        )
         count = compress(new, count, within, mine)
     store(codes, at, mine)
-    return mine, extremes, count
+    return mine, count
 
 
 @rule
-def _enter(new, count, counting, cells):  # type: ignore[no-untyped-def]
-    """Enter ``count`` codes into the grid."""
-    # Unsigned, because a signed index costs a check for counting from the end.
-    for k in range(np.uint64(count)):
-        code = np.uint32(new[k])
-        if counting:
-            cells[code >> np.uint32(3)] += 1
-        else:
-            cells[code >> np.uint32(3)] |= np.uint8(1) << (code & np.uint32(7))
-
-
-@rule
-def _widened(extremes, new, x, y, z):  # type: ignore[no-untyped-def]
-    a, b, c, d, e, f = extremes
-    return (
-        where(new, smaller(a, x), a), where(new, smaller(b, y), b), where(new, smaller(c, z), c),
-        where(new, larger(d, x), d), where(new, larger(e, y), e), where(new, larger(f, z), f),
-    )  # fmt: skip
-
-
-@rule
-def _nothing():  # type: ignore[no-untyped-def]
-    far, near = fill(FARTHEST), fill(NOWHERE)
-    return far, far, far, near, near, near
-
-
-@rule
-def _widen(box, extremes, room):  # type: ignore[no-untyped-def]
-    """Widen ``box`` to ``extremes``; ``room`` (LANES,) is working memory."""
-    for k in range(6):
-        store(room, 0, extremes[k])
-        for lane in range(LANES):
-            box[k] = min(box[k], room[lane]) if k < 3 else max(box[k], room[lane])
+def packed(x, y, z, bits):  # type: ignore[no-untyped-def]
+    """Return whole parts x, y, z as one number; see :attr:`Lattice.bits`."""
+    return add(shift_left(add(shift_left(x, bits[0]), y), bits[1]), z)
 
 
 @bare_kernel
-def mark_points(points, T, limits, shape, shift, counting, codes, new, few, box, cells):  # type: ignore[no-untyped-def]
+def enter(new, count, bits, shape, shift, counting, box, codes, cells):  # type: ignore[no-untyped-def]
+    """Enter ``count`` packed parts into the flat grid ``cells``, and widen ``box``, see :func:`new_box`.
+
+    ``new`` has room for LANES more; ``codes`` (LANES,) is working memory.
+    """
+    if count == 0:
+        return
+    store(new, count, fill(new[0]))  # the last vector of codes is a whole one
+    low = (fill(FARTHEST), fill(FARTHEST), fill(FARTHEST))
+    high = (fill(NOWHERE), fill(NOWHERE), fill(NOWHERE))
+    m = np.int32(shift)
+    last_y, last_z = np.int32((1 << bits[0]) - 1), np.int32((1 << bits[1]) - 1)
+    last_x = np.int32((1 << (MOST_BITS - bits[0] - bits[1])) - 1)  # the highest bit is no sign
+    for first in range(0, count, LANES):
+        part = load(new, first)
+        xy = shift_right(part, bits[1])
+        x, y, z = shift_right(xy, bits[0]), bit_and(xy, fill(last_y)), bit_and(part, fill(last_z))
+        x = bit_and(x, fill(last_x))
+        low = smaller(low[0], x), smaller(low[1], y), smaller(low[2], z)
+        high = larger(high[0], x), larger(high[1], y), larger(high[2], z)
+        store(codes, 0, code_of(x, y, z, shape[1], shape[2], m))
+        # Unsigned, because a signed index costs a check for counting from the end.
+        for k in range(np.uint64(min(LANES, count - first))):
+            code = np.uint32(codes[k])
+            if counting:
+                cells[code >> np.uint32(3)] += 1
+            else:
+                cells[code >> np.uint32(3)] |= np.uint8(1) << (code & np.uint32(7))
+    for k in range(3):
+        store(codes, 0, low[k])
+        for lane in range(LANES):
+            box[k] = min(box[k], codes[lane] >> shift)
+        store(codes, 0, high[k])
+        for lane in range(LANES):
+            box[3 + k] = max(box[3 + k], codes[lane] >> shift)
+
+
+@bare_kernel
+def mark_points(points, T, limits, bits, shape, shift, counting, codes, new, few, few_codes, box, cells):  # type: ignore[no-untyped-def]
     """Enter ``points`` (N, 3) into the flat grid ``cells``, and widen ``box``, see :func:`new_box`.
 
     ``codes``, ``new`` and ``few`` are working memory, see :class:`Marking`.
     """
-    xyz, m = points.reshape(-1), np.int32(shift)
+    xyz = points.reshape(-1)
     codes[:] = NOWHERE  # the grid may have been emptied since
-    left, extremes, count = fill(NOWHERE), _nothing(), 0
+    left, count = fill(NOWHERE), 0
     for at in range(0, xyz.shape[0], 3 * LANES):
         if at + 3 * LANES <= xyz.shape[0]:
             px, py, pz = load_triples(xyz, at)
@@ -233,27 +244,40 @@ def mark_points(points, T, limits, shape, shift, counting, codes, new, few, box,
                 few[k] = xyz[at + k]
             px, py, pz = load_triples(few, 0)
         x, y, z = moved(T, 0, px, py, pz), moved(T, 1, px, py, pz), moved(T, 2, px, py, pz)
-        left, extremes, count = _mark(
-            x, y, z, ALL, left, codes, 0, limits, shape, m, counting, extremes, new, count
-        )
+        left, count = _mark(x, y, z, ALL, left, codes, 0, limits, bits, counting, new, count)
         if count > MOST_NEW:
-            _enter(new, count, counting, cells)
+            enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
             count = 0
-    _enter(new, count, counting, cells)
-    _widen(box, extremes, codes)
+    enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
 
 
 @bare_kernel
 def mark_depth(  # type: ignore[no-untyped-def]
-    depth, first, last, column, row, t, limits, shape, shift, counting, codes, new, few, box, cells
+    depth,
+    first,
+    last,
+    column,
+    row,
+    t,
+    limits,
+    bits,
+    shape,
+    shift,
+    counting,
+    codes,
+    new,
+    few,
+    few_codes,
+    box,
+    cells,
 ):
     """As :func:`mark_points`, for rows ``first`` to ``last`` (exclusive) of a depth image, see :class:`Rays`.
 
     A pixel's neighbours are the one before it, the one above, and the next to that.
     """
-    flat, width, m = depth.reshape(-1), depth.shape[1], np.int32(shift)
+    flat, width = depth.reshape(-1), depth.shape[1]
     codes[:] = NOWHERE
-    extremes, count = _nothing(), 0
+    count = 0
     for v in range(first, last):
         left = fill(NOWHERE)
         for u in range(0, width, LANES):
@@ -269,14 +293,11 @@ def mark_depth(  # type: ignore[no-untyped-def]
             y = along_ray(t[1], far, load(column[1], u), row[1, v])
             z = along_ray(t[2], far, load(column[2], u), row[2, v])
             known = ~equal(raw, sub(raw, raw))
-            left, extremes, count = _mark(
-                x, y, z, known, left, codes, u, limits, shape, m, counting, extremes, new, count
-            )
+            left, count = _mark(x, y, z, known, left, codes, u, limits, bits, counting, new, count)
             if count > MOST_NEW:
-                _enter(new, count, counting, cells)
+                enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
                 count = 0
-    _enter(new, count, counting, cells)
-    _widen(box, extremes, codes)
+    enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
 
 
 @bare_kernel
@@ -299,6 +320,7 @@ class Marking:
     new: npt.NDArray[np.int32]
     few_points: F32
     few_pixels: U16
+    few_codes: npt.NDArray[np.int32]
 
     @classmethod
     def of(cls, width: int) -> Marking:
@@ -309,15 +331,16 @@ class Marking:
             np.empty(MOST_NEW + 2 * LANES, np.int32),
             np.empty(3 * LANES, np.float32),
             np.empty(LANES, np.uint16),
+            np.empty(LANES, np.int32),
         )
 
     def for_points(self) -> tuple[npt.NDArray[Any], ...]:
         """Return what :func:`mark_points` needs."""
-        return self.codes[: 2 * LANES], self.new, self.few_points
+        return self.codes[: 2 * LANES], self.new, self.few_points, self.few_codes
 
     def for_depth(self, width: int) -> tuple[npt.NDArray[Any], ...]:
         """Return what :func:`mark_depth` needs for an image as wide as that, as wide as it was made for at most."""
-        return self.codes[: _whole_vectors(width) + LANES], self.new, self.few_pixels
+        return self.codes[: _whole_vectors(width) + LANES], self.new, self.few_pixels, self.few_codes
 
 
 def _whole_vectors(width: int) -> int:
@@ -365,7 +388,7 @@ def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cell
     cells: npt.NDArray[Any] = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
     T, limits, memory = part_transform(cloud, lattice), lattice.limits(), Marking.of(LANES).for_points()
     mark_points(
-        cloud.points, T, limits, lattice.shape, lattice.subdivision - 1, count, *memory, new_box(), cells
+        cloud.points, T, limits, lattice.bits, lattice.shape, lattice.subdivision - 1, count, *memory, new_box(), cells
     )  # fmt: skip
     return cells.reshape(lattice.shape)
 
@@ -376,7 +399,7 @@ def voxelize_depth(image: DepthImage, lattice: Lattice, count: bool = False) -> 
     rays, (height, width) = Rays.of(image, lattice), image.depth.shape
     memory = Marking.of(width).for_depth(width)
     mark_depth(
-        image.depth, 0, height, rays.column, rays.row, rays.t, lattice.limits(), lattice.shape,
+        image.depth, 0, height, rays.column, rays.row, rays.t, lattice.limits(), lattice.bits, lattice.shape,
         lattice.subdivision - 1, count, *memory, new_box(), cells,
     )  # fmt: skip
     return cells.reshape(lattice.shape)

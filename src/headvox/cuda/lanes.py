@@ -17,8 +17,7 @@ import numpy as np
 from numba import cuda
 from numba.core import config
 
-from headvox.integral import box_sum
-from headvox.vote import sum_about
+from headvox.integral import box_sum, sum_about
 
 SIMULATED = bool(getattr(config, "ENABLE_CUDASIM", 0))
 

@@ -24,7 +24,7 @@ MOST_THREADS = 256  # of a block; a power of two
 
 _rank = on_device(rank, **LANE_WISE, order=on_device(order, **LANE_WISE))
 _statistics_of = on_device(statistics_of, **LANE_WISE, rank=_rank)
-_votes_at = on_device(votes_at, sum_about=sum_about_voxel, product=product_64)
+_votes_at = on_device(votes_at, sum_in_halves=sum_about_voxel, product=product_64)
 
 
 @kernel

@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.compile_masks import voxel_box
-from headvox.integral import Integral
+from headvox.integral import Integral, sum_about
 from headvox.kernels import kernel
 from headvox.masks import CHANNELS, STATISTICS, Box, Group, ring, statistics
-from headvox.vote import sum_about
 
 VOXEL_M, SUBDIVISION = 0.05, 2
 

@@ -6,9 +6,10 @@ import pytest
 from headvox.data import Intrinsics
 from headvox.frames import unproject
 from headvox.synth.camera import IDEAL, Lidar, d435i, kinect, measure, noise_field, sweep
+from headvox.synth.furniture import item
 from headvox.synth.mounts import camera_pose, lens
 from headvox.synth.rays import View, look
-from headvox.synth.room import box, item
+from headvox.synth.solids import box
 
 LENS = Intrinsics(320, 240, 215.0, 215.0, 159.5, 119.5)
 CLEAN = replace(IDEAL, baseline_m=0.05)

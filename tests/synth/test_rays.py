@@ -4,9 +4,10 @@ from scipy import ndimage
 
 from headvox.data import Intrinsics
 from headvox.frames import inverse, transform
+from headvox.synth.furniture import item
 from headvox.synth.mounts import camera_pose
 from headvox.synth.rays import Mesh, join, look, spin
-from headvox.synth.room import box, ellipsoid, item
+from headvox.synth.solids import box, ellipsoid
 
 LENS = Intrinsics(64, 48, 50.0, 50.0, 31.5, 23.5)
 

@@ -8,12 +8,15 @@ from headvox.frames import inverse, transform
 from headvox.synth import mannequin, presets
 from headvox.synth.actors import place_person
 from headvox.synth.camera import IDEAL, Lidar, kinect
+from headvox.synth.floorplan import FloorPlan
+from headvox.synth.furniture import item
 from headvox.synth.motion import RATE_HZ, Moment, between, live
 from headvox.synth.mounts import Camera, PlacedLidar, camera_pose, lens
 from headvox.synth.people import HAIR
 from headvox.synth.poses import Pose
-from headvox.synth.room import FloorPlan, box, item, sample_room
+from headvox.synth.room import sample_room
 from headvox.synth.scene import POSTURES, sample_scene, training_view
+from headvox.synth.solids import box
 
 
 def ideal(scene):

@@ -13,21 +13,12 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from headvox.data import F64
+from headvox.synth.floorplan import FloorPlan, footprint
+from headvox.synth.furniture import Item, bed, chair, pick, sofa, table
 from headvox.synth.motion import RATE_HZ, Moment, live
 from headvox.synth.people import PosedBody
 from headvox.synth.poses import Pose
-from headvox.synth.room import (
-    ON_TABLES,
-    FloorPlan,
-    Item,
-    Room,
-    bed,
-    chair,
-    footprint,
-    pick,
-    sofa,
-    table,
-)
+from headvox.synth.room import ON_TABLES, Room
 
 Rng = np.random.Generator
 

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from headvox.data import F64
 from headvox.synth.people import CLOTH, HAIR, SKIN, PosedBody
-from headvox.synth.poses import Pose, sample_pose, walking_pose
-from headvox.synth.room import Solid, ellipsoid, lathe
+from headvox.synth.poses import Pose
+from headvox.synth.postures import sample_pose, walking_pose
+from headvox.synth.solids import Solid, ellipsoid, lathe
 
 __all__ = ["Mannequin", "pose_person", "sample_person", "sample_pose", "walking_pose"]
 

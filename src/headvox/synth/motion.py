@@ -16,8 +16,8 @@ from scipy import ndimage
 
 from headvox.data import F64
 from headvox.errors import HeadvoxError
+from headvox.synth.floorplan import CELL_M, FloorPlan
 from headvox.synth.poses import Pose
-from headvox.synth.room import CELL_M, FloorPlan
 
 if TYPE_CHECKING:
     from headvox.synth.actors import People

@@ -23,17 +23,18 @@ from headvox.synth.bodies import (
     mean_head_scale,
     mean_height_m,
 )
-from headvox.synth.poses import POSTURES as POSTURES
+from headvox.synth.dress import Outfit, dress
 from headvox.synth.poses import Pose as Pose
 from headvox.synth.poses import pose_skeleton
-from headvox.synth.poses import sample_pose as sample_pose
-from headvox.synth.poses import walking_pose as walking_pose
+from headvox.synth.postures import POSTURES as POSTURES
+from headvox.synth.postures import sample_pose as sample_pose
+from headvox.synth.postures import walking_pose as walking_pose
 from headvox.synth.wear import CLOTH as CLOTH
 from headvox.synth.wear import GLASSES as GLASSES
 from headvox.synth.wear import HAIR as HAIR
 from headvox.synth.wear import HAT as HAT
 from headvox.synth.wear import SKIN as SKIN
-from headvox.synth.wear import Outfit, Wear, dress, sample_wear
+from headvox.synth.wear import Wear, sample_wear
 
 ROUND_DIGITS = 6  # micrometres
 TAKES_OFF_BACKPACK = ("sitting", "lying")

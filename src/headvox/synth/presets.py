@@ -12,9 +12,10 @@ from headvox.data import F64, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.synth.actors import Actor, People, animated, place_person, real_people
 from headvox.synth.camera import IDEAL, Lidar, Sensor, d435i
+from headvox.synth.floorplan import FloorPlan, rectangle
 from headvox.synth.motion import RATE_HZ, turning
 from headvox.synth.mounts import Camera, PlacedLidar, camera_pose, lens
-from headvox.synth.room import FloorPlan, rectangle, sample_room
+from headvox.synth.room import sample_room
 from headvox.synth.scene import POSTURE_SHARES, POSTURES, Scene, sample_scene
 
 Rng = np.random.Generator

@@ -30,10 +30,38 @@ def test_bash_completes_commands_and_flags(tmp_path: Path, capsys: pytest.Captur
     assert "list" in completed(script, "headvox", "masks", "li")
 
 
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells_get_theirs(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", shell]) == 0
-    assert "render" in capsys.readouterr().out
+def test_fish_completes_commands_flags_and_choices(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["completion", "fish"]) == 0
+    script = tmp_path / "headvox.fish"
+    script.write_text(capsys.readouterr().out)
+    assert "render" in script.read_text()
+    if shutil.which("fish") is None:
+        pytest.skip("no fish: only what is printed was looked at")
+
+    def completed_by_fish(line: str) -> set[str]:
+        command = ["fish", "--no-config", "-c", f"source {script}; complete -C '{line}'"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return {row.split("\t")[0] for row in done.stdout.splitlines()}
+
+    assert completed_by_fish("headvox ren") == {"render"}
+    assert {"--max-range", "--max-height"} <= completed_by_fish("headvox run --max-")
+    assert completed_by_fish("headvox run --backend ") >= {"cpu", "cuda", "auto"}
+
+
+def test_zsh_takes_what_is_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "zsh"]) == 0
+    script = tmp_path / "headvox.zsh"
+    script.write_text(capsys.readouterr().out)
+    assert "render" in script.read_text()
+    if shutil.which("zsh") is None:
+        pytest.skip("no zsh: only what is printed was looked at")
+    code = f'autoload -Uz compinit; compinit -u -d {tmp_path}/dump; eval "$(cat {script})"; '
+    code += 'print "${_comps[headvox]}"'
+    done = subprocess.run(["zsh", "-f", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "_shtab_headvox"
+    assert not done.stderr
 
 
 def test_without_shtab_the_extra_is_named(

@@ -19,7 +19,9 @@ def add_to(commands: Commands) -> None:
     """Add ``headvox completion`` to the command line."""
     completion = add_command(commands, "completion", _completion, "print what makes a shell complete headvox")
     completion.add_argument("shell", choices=SHELLS)
-    completion.epilog = 'bash: eval "$(headvox completion bash)"'
+    completion.epilog = (
+        'bash, zsh: eval "$(headvox completion SHELL)"; fish: headvox completion fish | source'
+    )
 
 
 def _completion(args: argparse.Namespace) -> int:

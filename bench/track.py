@@ -23,6 +23,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,6 +45,9 @@ FINE_HZ = 60
 RULES = Rules(radius_m=0.3)
 FALSE_A_FRAME = 0.05
 CLOSEST_M = 0.28
+NOISE_M_M2 = 0.0015  # a detection's noise on each axis: new in every frame
+BIAS_M, TURNS_M = 0.005, 0.5  # and what stays while the head does, and changes as it walks on so far
+STATED_M, STATED_M_M2 = 0.007, 0.0006  # what the detector says that both are
 SAME_HEAD_M = 0.18
 
 
@@ -161,53 +165,81 @@ class Outcome:
     ms: list[float] = field(default_factory=list)
 
 
-def run(count: int, hz: int, drop: float, seconds: float, seed: int) -> Outcome:
-    """Let a tracker follow a crowd."""
-    rng = np.random.default_rng([seed, count, hz, round(100 * drop)])
-    people = crowd(rng, count, seconds)
-    tracker, samples, bare, ms = Tracker(), [], [], []
-    bias, burst = np.zeros((count, 3)), np.zeros(count, bool)
-    trails: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {n: [] for n in range(count)}
-    for k in range(round(seconds * hz)):
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One frame of a crowd: what the tracker gets, and the truth.
+
+    ``found`` are the people that the first of ``heads`` are, in their order; what comes after is no head. ``shares``
+    (N,) is how much of each head the camera sees.
+    """
+
+    step: int
+    frame: Frame
+    heads: Heads
+    found: list[int]
+    places: np.ndarray
+    shares: np.ndarray
+
+
+def watch(rng: np.random.Generator, people: list[Person], hz: int, drop: float) -> Iterator[Moment]:
+    """Imitate a detector."""
+    count, steps = len(people), len(people[0].path)
+    bias, burst = rng.normal(0, BIAS_M, (count, 3)), np.zeros(count, bool)
+    for k in range(steps * hz // FINE_HZ):
         step = k * FINE_HZ // hz
         true = np.array([person.path[step] for person in people])
         image, shares = look(true)
         away = np.linalg.norm(true - T_WORLD_CAMERA[:3, 3], axis=1)
-        keep = np.exp(-1.0 / hz)
-        bias = keep * bias + np.sqrt(1 - keep**2) * rng.normal(0, 0.01, (count, 3))
+        speed = np.array([person.speed[step] for person in people])
+        keep = np.exp(-speed / hz / TURNS_M)[:, None]
+        bias = keep * bias + np.sqrt(1 - keep**2) * rng.normal(0, BIAS_M, (count, 3))
         # Half of the missing come in bursts of five frames on average.
         burst = np.where(burst, rng.random(count) > 0.2, rng.random(count) < 0.1 * drop / (1 - 0.5 * drop))
         missed = burst | (rng.random(count) < 0.5 * drop)
-        seen = np.flatnonzero((shares > 0.5) & ~missed)
-        noise = (0.003 + 0.002 * away**2)[:, None] * rng.normal(size=(count, 3))
-        found = [(n, true[n] + bias[n] + noise[n]) for n in seen]
-        found = [
-            (n, c)
-            for i, (n, c) in enumerate(found)
-            if all(np.linalg.norm(c - d) >= SAME_HEAD_M for _, d in found[:i])
-        ]
-        centres = [c for _, c in found]
+        measured = true + bias + (NOISE_M_M2 * away**2)[:, None] * rng.normal(size=(count, 3))
+        found: list[int] = []
+        for n in np.flatnonzero((shares > 0.5) & ~missed):
+            if all(np.linalg.norm(measured[n] - measured[m]) >= SAME_HEAD_M for m in found):
+                found.append(int(n))
+        centres = [measured[n] for n in found]
         false = rng.poisson(FALSE_A_FRAME)
         centres.extend(rng.uniform((-1.2, -1.2, 0.8), (2.0, 1.2, 1.8), (false, 3)))
-        heads = heads_at(centres)
         frame = Frame(round(k * 1e9 / hz), depths=(image,))
+        yield Moment(step, frame, heads_at(centres), found, true, shares)
+
+
+def run(count: int, hz: int, drop: float, seconds: float, seed: int) -> Outcome:
+    """Let a tracker follow a crowd."""
+    rng = np.random.default_rng([seed, count, hz, round(100 * drop)])
+    people = crowd(rng, count, seconds)
+    return follow(people, watch(rng, people, hz, drop), hz, seconds)
+
+
+def follow(people: list[Person], moments: Iterable[Moment], hz: int, seconds: float) -> Outcome:
+    """Let a tracker follow people, and score it."""
+    count = len(people)
+    tracker, samples, bare, ms = Tracker(), [], [], []
+    trails: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {n: [] for n in range(count)}
+    for moment in moments:
+        frame, heads, true = moment.frame, moment.heads, moment.places
         begun = time.perf_counter()
         tracker.expected(frame.stamp_ns)
         tracks = tracker.update(heads, frame)
         ms.append(1e3 * (time.perf_counter() - begun))
         known = tracks.states != State.TENTATIVE
         truth = TrueHeads(
-            frame.stamp_ns, true, np.full((count, 4), np.nan), np.arange(count), shares < 0.5,
+            frame.stamp_ns, true, np.full((count, 4), np.nan), np.arange(count), moment.shares < 0.5,
             np.zeros(count, bool), ({},) * count, {},
         )  # fmt: skip
         eye = T_WORLD_CAMERA[None, :3, 3]
         samples.append(Sample(frame.stamp_ns, as_found(tracks.centres[known], tracks.ids[known]), truth, eye))
-        ids = np.array([n for n, _ in found] + [1000 + k] * false, np.int64)
+        nobody = range(1000 + len(ms), 1000 + len(ms) + len(heads) - len(moment.found))
+        ids = np.array([*moment.found, *nobody], np.int64)
         bare.append(Sample(frame.stamp_ns, as_found(heads.centres, ids), truth, eye))
-        for n, measured in found:
+        for n, measured in zip(moment.found, heads.centres, strict=False):
             near = np.linalg.norm(tracks.centres - true[n], axis=1)
             if len(near) and near.min() < 0.15 and known[near.argmin()]:
-                trails[n].append((step, tracks.centres[near.argmin()] - true[n], measured - true[n]))
+                trails[n].append((moment.step, tracks.centres[near.argmin()] - true[n], measured - true[n]))
     scores, alone = score_tracks(samples, RULES), score_tracks(bare, RULES)
     assert scores is not None
     assert alone is not None
@@ -241,11 +273,14 @@ def measure_trail(
 
 
 def heads_at(centres: list[np.ndarray]) -> Heads:
-    """Return heads as the detector would."""
+    """Return heads as the detector would, with the covariances that it states."""
     n = len(centres)
+    places = np.array(centres).reshape(n, 3)
+    sigma = STATED_M + STATED_M_M2 * ((places - T_WORLD_CAMERA[:3, 3]) ** 2).sum(axis=1)
     return Heads(
-        np.array(centres).reshape(n, 3), np.full((n, 4), np.nan), np.full(n, HEAD_RADIUS_M), np.full(n, 5.0)
-    )
+        places, np.full((n, 4), np.nan), np.full(n, HEAD_RADIUS_M), np.full(n, 5.0),
+        sigma[:, None, None] ** 2 * np.eye(3),
+    )  # fmt: skip
 
 
 def as_found(centres: np.ndarray, ids: np.ndarray) -> FoundHeads:

@@ -32,9 +32,15 @@ def update(x, P, d, R):
     return x + K @ d, rest @ P @ rest.T + K @ R @ K.T
 
 
-def predict_place(x, P, weight, dt, still_s, moving_s, wander, density, still_speed):
+def slowing(dt, fade_s):
+    """Return what a speed that fades within ``fade_s`` (3,) does: the transition of position and velocity."""
+    left = np.exp(-dt / fade_s)
+    return np.block([[np.eye(3), np.diag(fade_s * (1 - left))], [np.zeros((3, 3)), np.diag(left)]])
+
+
+def predict_place(x, P, weight, seen, dt, still_s, moving_s, wander, density, fade_s, still_speed):
     """Return models, covariances and weights of one track ``dt`` later."""
-    rise, halt = 1 - np.exp(-dt / still_s), 1 - np.exp(-dt / moving_s)
+    rise, halt = 1 - np.exp(-dt / still_s), (1 - np.exp(-dt / moving_s)) * seen
     change = np.array([[1 - rise, rise], [halt, 1 - halt]])  # from the row to the column
     after = weight @ change
     mixed = [mixture(change[:, j] * weight / after[j], x, P) for j in range(2)]
@@ -42,9 +48,15 @@ def predict_place(x, P, weight, dt, still_s, moving_s, wander, density, still_sp
     F = np.diag([1.0, 1, 1, 0, 0, 0])
     Q = np.diag([wander * dt] * 3 + [still_speed**2] * 3)
     still, P_still = F @ still, F @ P_still @ F.T + Q
-    F = transition(dt)
+    F = transition(dt) if seen else slowing(dt, fade_s)
     moving, P_moving = F @ moving, F @ P_moving @ F.T + white_noise(dt, density)
     return np.array([still, moving]), np.array([P_still, P_moving]), after
+
+
+def surprise(x, P, weight, centre, R):
+    """Return -2 ln of the density of a measured centre."""
+    likely = [multivariate_normal.pdf(centre, m[:3], C[:3, :3] + R) for m, C in zip(x, P, strict=True)]
+    return -2 * np.log(weight @ likely)
 
 
 def correct_place(x, P, weight, centre, R):

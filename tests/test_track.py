@@ -12,9 +12,10 @@ import scenes
 from headvox.config import TrackerConfig
 from headvox.data import Cloud, DepthImage, Frame, Heads, Intrinsics, State, Tracks
 from headvox.errors import HeadvoxError
+from headvox.noise import measurement_noise
 from headvox.pipeline import Detector
 from headvox.sources import open_source
-from headvox.track import Tracker, measurement_noise
+from headvox.track import Tracker
 
 FILINHA = Path(__file__).parents[1].parent / "shared" / "data" / "recordings" / "filinha"
 MS = 1_000_000
@@ -107,15 +108,18 @@ def test_a_walking_head_has_its_velocity_and_no_lag() -> None:
     assert tracks.unseen_s[0] == 0.0
 
 
-def test_a_still_head_is_smoothed() -> None:
+@pytest.mark.parametrize("stated_m", [0.006, 0.018])
+def test_a_still_head_is_smoothed_whatever_its_detector_states(stated_m) -> None:
     rng = np.random.default_rng(0)
     tracker, centres = Tracker(), []
     for k in range(300):
-        place = np.array([1.0, 0.5, 1.6]) + rng.normal(0.0, 0.006, 3)
-        centres.append(tracker.update(heads(tuple(place)), Frame(k * 33 * MS)).centres[0])
-    spread = np.std(centres[60:], axis=0)
-    assert spread.max() < 0.002
-    assert np.linalg.norm(np.mean(centres[60:], axis=0) - [1.0, 0.5, 1.6]) < 0.002
+        place = np.array([1.0, 0.5, 1.6]) + rng.normal(0.0, 0.018, 3)
+        seen = replace(heads(tuple(place)), centre_covariances=stated_m**2 * np.eye(3)[None])
+        centres.append(tracker.update(seen, Frame(k * 33 * MS)).centres[0])
+    assert np.linalg.norm(np.std(centres[60:], axis=0)) < 0.005
+    seconds = np.std(np.reshape(centres[60:], (8, 30, 3)), axis=1)
+    assert np.sqrt((seconds**2).sum(axis=1).mean()) < 0.002
+    assert np.linalg.norm(np.mean(centres[60:], axis=0) - [1.0, 0.5, 1.6]) < 0.005
 
 
 def test_coasting_goes_on_along_the_path_and_is_told() -> None:
@@ -336,6 +340,29 @@ def test_a_hidden_head_does_not_become_a_taller_one() -> None:
     assert sorted(tracks.ids.tolist()) == [1, 2]
 
 
+def test_of_two_who_stood_close_each_is_known_by_height() -> None:
+    """Both are missed until their tracks end; then it is the smaller one that is seen first."""
+    tracker, tall, small = Tracker(), (1.0, 0.5, 1.72), (1.0, 0.78, 1.6)
+    for k in range(30):
+        tracker.update(heads(tall, small), at(k))
+    follow(tracker, [None] * 15, 30)
+    assert follow(tracker, [small] * 5, 45).ids.tolist() == [2]
+    for k in range(50, 55):
+        tracks = tracker.update(heads(tall, small), at(k))
+    assert tracks.ids.tolist() == [1, 2]
+    np.testing.assert_allclose(tracks.centres, [tall, small], atol=0.02)
+
+
+def test_something_far_away_for_a_moment_does_not_lead_a_track_astray() -> None:
+    tracker, (x, y, z) = Tracker(), STANDING[0]
+    follow(tracker, STANDING * 30)
+    follow(tracker, [None] * 5 + [(x + 0.8, y, z)] + [None] * 2, 30)
+    tracks = follow(tracker, STANDING * 3, 38)
+    assert tracks.ids.tolist() == [1]
+    np.testing.assert_allclose(tracks.centres[0], STANDING[0], atol=0.02)
+    assert tracker.ids_given == 1
+
+
 def test_a_head_that_comes_back_before_it_is_given_up_is_the_same_one() -> None:
     """It stood, was missed while it walked off sideways, and is found farther away than its track expects."""
     tracker = Tracker()
@@ -404,6 +431,17 @@ def test_a_head_that_comes_back_is_the_same_one() -> None:
     tracks = follow(tracker, walk(3, 40), 45)
     assert tracks.ids.tolist() == [1]
     assert tracks.ages_s[0] == pytest.approx(4.7)
+
+
+def test_who_went_out_is_known_again_by_height() -> None:
+    """For 12 seconds; the other one, 15 cm smaller, comes in at the same place before."""
+    tracker = Tracker()
+    follow(tracker, walk(20))
+    follow(tracker, [None] * 60, 20)
+    x, y, z = walk(20)[-1]
+    assert follow(tracker, [(x + 0.5, y, z - 0.15)] * 3, 80).ids.tolist() == [2]
+    follow(tracker, [None] * 57, 83)
+    assert follow(tracker, [(x + 0.5, y, z)] * 3, 140).ids.tolist() == [1]
 
 
 @pytest.mark.parametrize("place", [(1.52, 0.57, 1.2), (-1.6, 0.57, 1.6)])

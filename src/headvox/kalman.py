@@ -8,8 +8,8 @@ smoothed hard, and one that sets off is followed at once.
 Orientation: an error-state (multiplicative) Kalman filter. The state is a quaternion q, world from head, and the turn
 rate in head axes [rad/s]; the covariance is that of the small turn d in R_true = R exp(d), and of the rate.
 
-Arrays have a row a track. ``x`` (N, 2, 6) position and velocity by the models; ``P`` (N, 2, 6, 6); ``weight`` (N, 2) of
-still and moving; ``q`` (N, 4) x y z w; ``rate`` (N, 3); ``C`` (N, 6, 6) covariance of turn and rate.
+Arrays have a row a track. ``x`` (N, 2, 6) position and velocity by the models; ``P`` (N, 2, 6, 6); ``weights`` (N, 2)
+of still and moving; ``q`` (N, 4) x y z w; ``rate`` (N, 3); ``C`` (N, 6, 6) covariance of turn and rate.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from headvox.kernels import kernel, rule
 
 STILL, MOVING = 0, 1
+LN_2_PI = float(np.log(2.0 * np.pi))
 LEAST_WEIGHT = 1e-6  # a model is never ruled out for good
 FIRST_RATE_RAD_S = 1.0
 STILL_SPEED_M_S = 0.01  # what the still model takes for rest
@@ -63,6 +64,28 @@ def _drift(P, dt, density):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             P[i, 3 + j] += dt * P[3 + i, 3 + j]
+    _stir(P, dt, density)
+
+
+@rule
+def _slow_down(x, P, dt, fade_s):  # type: ignore[no-untyped-def]
+    """Predict the (6,) state and its covariance of what slows down: a speed that fades within ``fade_s`` (3,)."""
+    for i in range(3):
+        left = np.exp(-dt / fade_s[i])
+        way = fade_s[i] * (1.0 - left)  # that a speed of 1 goes on
+        x[i] += way * x[3 + i]
+        x[3 + i] *= left
+        for j in range(6):
+            P[i, j] += way * P[3 + i, j]
+            P[3 + i, j] *= left
+        for j in range(6):
+            P[j, i] += way * P[j, 3 + i]
+            P[j, 3 + i] *= left
+
+
+@rule
+def _stir(P, dt, density):  # type: ignore[no-untyped-def]
+    """Add to the (6, 6) covariance of a value and its rate what white noise on the rate's rate does in ``dt``."""
     for i in range(3):
         P[i, i] += density[i] * dt * dt * dt / 3.0
         P[i, 3 + i] += density[i] * dt * dt / 2.0
@@ -171,28 +194,36 @@ def _new_axes(C, q, half):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def predict_places(x, P, weight, dt, still_s, moving_s, wander, density):  # type: ignore[no-untyped-def]
+def predict_places(x, P, weights, seen, dt, still_s, moving_s, wander, density, fade_s):  # type: ignore[no-untyped-def]
     """Mix the models and predict each by ``dt`` seconds, in place.
 
     ``still_s`` and ``moving_s`` are the mean times between a change of model [s], ``wander`` the variance that a still
-    position gains a second [m²/s], ``density`` (3,) that of the white acceleration along each axis [m²/s³].
+    position gains a second [m²/s], ``density`` (3,) that of the white acceleration along each axis [m²/s³]. Of one that
+    was not ``seen`` (N,) last time, the speed fades within ``fade_s`` (3,), and what is still stays where it was seen:
+    it may set off, but what moves does not come to rest in it.
     """
-    rises, halts = 1.0 - np.exp(-dt / still_s), 1.0 - np.exp(-dt / moving_s)
+    rises, stops = 1.0 - np.exp(-dt / still_s), 1.0 - np.exp(-dt / moving_s)
     for n in range(x.shape[0]):
-        rested, moved = weight[n, STILL], weight[n, MOVING]
-        weight[n, STILL] = rested * (1.0 - rises) + moved * halts
-        weight[n, MOVING] = rested * rises + moved * (1.0 - halts)
-        still = rested * (1.0 - rises) / weight[n, STILL]  # share of those that rest now that rested before
-        moving = moved * (1.0 - halts) / weight[n, MOVING]
+        halts = stops if seen[n] else 0.0
+        rested, moved = weights[n, STILL], weights[n, MOVING]
+        weights[n, STILL] = rested * (1.0 - rises) + moved * halts
+        weights[n, MOVING] = rested * rises + moved * (1.0 - halts)
+        still = rested * (1.0 - rises) / weights[n, STILL]  # share of those that rest now that rested before
+        moving = moved * (1.0 - halts) / weights[n, MOVING]
         _exchange(x[n], P[n], still, moving)
         for a in range(3):
             x[n, STILL, 3 + a] = 0.0
-            x[n, MOVING, a] += dt * x[n, MOVING, 3 + a]
             for b in range(6):
                 P[n, STILL, 3 + a, b] = P[n, STILL, b, 3 + a] = 0.0
             P[n, STILL, 3 + a, 3 + a] = STILL_SPEED_M_S * STILL_SPEED_M_S
             P[n, STILL, a, a] += wander * dt
-        _drift(P[n, MOVING], dt, density)
+        if seen[n]:
+            for a in range(3):
+                x[n, MOVING, a] += dt * x[n, MOVING, 3 + a]
+            _drift(P[n, MOVING], dt, density)
+        else:
+            _slow_down(x[n, MOVING], P[n, MOVING], dt, fade_s)
+            _stir(P[n, MOVING], dt, density)
 
 
 @kernel
@@ -211,10 +242,10 @@ def predict_turns(q, rate, C, dt, density):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def combine(x, P, weight, mean, cov):  # type: ignore[no-untyped-def]
+def combine(x, P, weights, mean, cov):  # type: ignore[no-untyped-def]
     """Write the mean (N, 6) and the covariance (N, 6, 6) of both models together."""
     for n in range(x.shape[0]):
-        still, moving = weight[n, STILL], weight[n, MOVING]
+        still, moving = weights[n, STILL], weights[n, MOVING]
         for a in range(6):
             mean[n, a] = still * x[n, 0, a] + moving * x[n, 1, a]
             for b in range(6):
@@ -222,9 +253,33 @@ def combine(x, P, weight, mean, cov):  # type: ignore[no-untyped-def]
                 cov[n, a, b] = still * P[n, 0, a, b] + moving * P[n, 1, a, b] + still * moving * apart
 
 
+@rule
+def _surprise(x, P, weights, centre, R, S, S_inverse, d):  # type: ignore[no-untyped-def]
+    """Return -2 ln of how likely a measured ``centre`` of covariance ``R`` is, of both models together [ln m⁻³]."""
+    best, total = -np.inf, 0.0
+    for i in range(2):
+        for a in range(3):
+            d[a] = centre[a] - x[i, a]
+            for b in range(3):
+                S[a, b] = P[i, a, b] + R[a, b]
+        log_det = np.log(_invert(S, S_inverse))
+        fit = np.log(weights[i]) - 0.5 * (_squared(S_inverse, d) + log_det)
+        if fit > best:
+            total = total * np.exp(best - fit) + 1.0
+            best = fit
+        else:
+            total += np.exp(fit - best)
+    return -2.0 * (best + np.log(total)) + 3.0 * LN_2_PI
+
+
 @kernel
-def compare(mean, cov, centres, R, squared, log_det):  # type: ignore[no-untyped-def]
-    """Write the squared Mahalanobis distance (N, M) of each of M measured ``centres`` to each track, and ln det S."""
+def compare(x, P, weights, mean, cov, centres, R, squared, surprise):  # type: ignore[no-untyped-def]
+    """Write how well each of M measured ``centres`` fits to each of N tracks, both (N, M).
+
+    ``squared`` is the squared Mahalanobis distance from ``mean`` and ``cov`` (of :func:`combine`), ``surprise`` -2 ln
+    of the density [m⁻³] of finding it there, of both models: a head at rest is mostly found where it was, and
+    anywhere about when it has set off. ``R`` (M, 3, 3) are the covariances of the centres.
+    """
     S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for n in range(mean.shape[0]):
         for m in range(centres.shape[0]):
@@ -232,12 +287,13 @@ def compare(mean, cov, centres, R, squared, log_det):  # type: ignore[no-untyped
                 d[a] = centres[m, a] - mean[n, a]
                 for b in range(3):
                     S[a, b] = cov[n, a, b] + R[m, a, b]
-            log_det[n, m] = np.log(_invert(S, S_inverse))
+            _invert(S, S_inverse)
             squared[n, m] = _squared(S_inverse, d)
+            surprise[n, m] = _surprise(x[n], P[n], weights[n], centres[m], R[m], S, S_inverse, d)
 
 
 @kernel
-def correct_places(x, P, weight, tracks, heads, centres, R):  # type: ignore[no-untyped-def]
+def correct_places(x, P, weights, tracks, heads, centres, R):  # type: ignore[no-untyped-def]
     """Update the tracks with index ``tracks`` (K,) by the measured centres with index ``heads`` (K,), in place."""
     S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     gain, step, fit = np.empty((6, 3)), np.empty(6), np.empty(2)
@@ -254,9 +310,9 @@ def correct_places(x, P, weight, tracks, heads, centres, R):  # type: ignore[no-
             for a in range(6):
                 x[n, i, a] += step[a]
         best = max(fit[0], fit[1])
-        still, moving = weight[n, STILL] * np.exp(fit[0] - best), weight[n, MOVING] * np.exp(fit[1] - best)
-        weight[n, STILL] = min(max(still / (still + moving), LEAST_WEIGHT), 1.0 - LEAST_WEIGHT)
-        weight[n, MOVING] = 1.0 - weight[n, STILL]
+        still, moving = weights[n, STILL] * np.exp(fit[0] - best), weights[n, MOVING] * np.exp(fit[1] - best)
+        weights[n, STILL] = min(max(still / (still + moving), LEAST_WEIGHT), 1.0 - LEAST_WEIGHT)
+        weights[n, MOVING] = 1.0 - weights[n, STILL]
 
 
 @kernel

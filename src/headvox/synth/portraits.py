@@ -24,11 +24,12 @@ POSTURES = ("standing", "walking", "sitting")
 
 @dataclass(frozen=True, slots=True)
 class Portrait:
-    """One frame of one person: the truth, and who it is."""
+    """One frame of one person: the truth, who it is, and the scene that it is the first frame of."""
 
     frame: Frame
     head: TrueHead
     person: Person
+    scene: Scene
 
 
 def portrait(
@@ -63,9 +64,10 @@ def portrait(
         if any(room.plan.conflict(_stand(T)) > 0.0 for T in poses):
             continue
         rig = [Camera(f"camera_{k}", lens("d435i"), T, d435i()) for k, T in enumerate(poses)]
-        frame, heads = Scene(int(rng.integers(2**31)), people, room, [actor], rig).frame(0)
+        scene = Scene(int(rng.integers(2**31)), people, room, [actor], rig)
+        frame, heads = scene.frame(0)
         if min(heads[0].visible.values()) >= LEAST_VISIBLE and not heads[0].truncated:
-            return Portrait(frame, heads[0], actor.person)
+            return Portrait(frame, heads[0], actor.person, scene)
     raise HeadvoxError(f"No room in {TRIES} had space for such a view.", "Take another seed or distance.")
 
 

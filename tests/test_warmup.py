@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 
+from headvox import warmup
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Intrinsics
 from headvox.errors import HeadvoxError
@@ -75,3 +77,27 @@ def test_an_unknown_cascade_is_told() -> None:
 def test_the_cache_is_a_folder() -> None:
     warm_up(DetectorConfig())
     assert cache_folder().is_dir()
+
+
+def test_another_process_compiles_the_pose_fit_where_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = []
+
+    class Noted(subprocess.Popen):  # type: ignore[type-arg]
+        def __init__(self, command: list[str], **settings: int) -> None:
+            begun.append(self)
+            super().__init__(command, **settings)
+
+    monkeypatch.setattr(warmup, "_is_kept", lambda kernel: False)
+    monkeypatch.setattr(warmup.subprocess, "Popen", Noted)
+    warm_up(DetectorConfig())
+    assert [process.returncode for process in begun] == [0]
+    warm_up(DetectorConfig(refine="sphere"))
+    assert len(begun) == 1
+
+
+def test_the_other_process_compiles_the_fit_for_all_that_a_detector_hands_it() -> None:
+    code = "import headvox.warmup as w; w._fit(); print(sorted(map(str, w.fit_head.signatures)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    warm_up(DetectorConfig())
+    assert done.stdout.strip() == str(sorted(map(str, warmup.fit_head.signatures)))
+    assert warmup.fit_head.signatures

@@ -2,45 +2,89 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from headvox.align import Scratch
 from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
+from headvox.kernels import Threads
 from headvox.pipeline import Detector
+from headvox.pose import fit_poses
 from headvox.read_masks import load_cascade
+from headvox.settle import fit_head
 from headvox.track import Tracker
 
 _ANYTHING = 1 << 40
+VOXEL_M = 0.025
 
 
 def warm_up(config: DetectorConfig) -> None:
     """Run a detector as ``config`` asks for, over a few voxels of points and a depth image of a few pixels.
 
+    Where the disk has no compiled loops yet, two processes share the work: another one compiles the pose fit.
+
     Raises:
         HeadvoxError: no such cascade.
     """
     voxel = config.voxel_m or load_cascade(config.cascade).voxel_m
-    near = replace(config, max_range_m=6 * voxel, min_height_m=-6 * voxel, max_height_m=6 * voxel)
-    detector = Detector(replace(near, centre=(0.0, 0.0, 0.0), min_score=-1e6))
+    tiny = replace(
+        config,
+        centre=(0.0, 0.0, 0.0),
+        max_range_m=6 * voxel,
+        min_height_m=-6 * voxel,
+        max_height_m=6 * voxel,
+        min_score=-1e6,
+    )
+    if config.refine == "pose" and not _is_kept(fit_head):
+        nothing = subprocess.DEVNULL  # what it cannot compile is compiled here, and told here
+        command = [sys.executable, "-m", "headvox.warmup"]
+        with subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing):
+            _search(replace(tiny, refine="sphere"), voxel)
+            _follow()
+    _search(tiny, voxel)
+    _follow()
+
+
+def _search(config: DetectorConfig, voxel: float) -> None:
+    detector = Detector(config)
     detector.cascade = _open(detector.cascade)
+    for cloud, image in _frames(voxel):
+        detector.detect_frame(cloud)
+        detector.detect_frame(image)
+        detector.detect_frame(image, _expected())
+    detector.close()
+
+
+def _fit() -> None:
+    scratch, threads = [Scratch.new()], Threads(1)
+    for frames in _frames(VOXEL_M):
+        for frame in frames:
+            fit_poses(frame, np.zeros((2, 3)), scratch, threads, _expected())
+    threads.close()
+
+
+def _frames(voxel: float) -> Iterator[tuple[Frame, Frame]]:
+    """Yield a frame of points and one of an image: in memory of one's own, and in somebody else's.
+
+    Numba compiles a loop anew for the latter.
+    """
     grid = voxel * np.linspace(-2, 2, 9, dtype=np.float32)
     points = np.stack(np.meshgrid(grid, grid, grid), axis=-1).reshape(-1, 3).astype(np.float32)
     wall = np.full((12, 16), 3, np.uint16)
     camera = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0, depth_scale=voxel)
-    # Numba compiles a loop anew for arrays that lie in somebody else's buffer.
     for writeable in (True, False):
         points.flags.writeable = wall.flags.writeable = writeable
-        detector.detect_frame(Frame(0, clouds=(Cloud("warm-up", points),)))
-        frame = Frame(0, depths=(DepthImage("warm-up", wall, camera, np.eye(4)),))
-        detector.detect_frame(frame)
-        detector.detect_frame(frame, _expected())
-        _follow(frame)
-    detector.close()
+        image = DepthImage("warm-up", wall, camera, np.eye(4))
+        yield Frame(0, clouds=(Cloud("warm-up", points),)), Frame(0, depths=(image,))
 
 
 def _expected() -> Expected:
@@ -49,17 +93,24 @@ def _expected() -> Expected:
     return Expected(np.zeros((2, 3)), turns, np.full(2, 0.3))
 
 
-def _follow(frame: Frame) -> None:
+def _follow() -> None:
     """Run a tracker over a head that is new, seen again, and looked for."""
-    tracker = Tracker()
     head = Heads(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), np.full(1, 0.1), np.ones(1))
-    for k, found in enumerate((head, head, Heads())):
-        tracker.update(found, replace(frame, stamp_ns=k))
+    for _, image in _frames(VOXEL_M):
+        tracker = Tracker()
+        for k, found in enumerate((head, head, Heads())):
+            tracker.update(found, replace(image, stamp_ns=k))
 
 
 def cache_folder() -> Path:
     """Return the folder where the compiled loops are kept."""
     return Path(gate_columns.stats.cache_path)  # type: ignore[attr-defined]
+
+
+def _is_kept(kernel: Any) -> bool:
+    """Whether the disk has some version of a compiled loop."""
+    name = f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}-*"
+    return any(cache_folder().glob(name))
 
 
 def _open(cascade: CompiledCascade) -> CompiledCascade:
@@ -76,3 +127,7 @@ def _open(cascade: CompiledCascade) -> CompiledCascade:
         stages=opened(cascade.stages),
         judge=opened(cascade.judge),
     )
+
+
+if __name__ == "__main__":
+    _fit()

@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 from headvox.align import Scratch
 from headvox.data import Cloud, Expected, Frame
 from headvox.errors import HeadvoxError
-from headvox.kernels import Threads
 from headvox.pose import fit_poses
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
+from headvox.threads import Threads
 from headvox.workers import Workers
 
 EVALUATION = 0xE7A1

@@ -7,12 +7,12 @@ from scipy.spatial.transform import Rotation
 from headvox import Cloud, DepthImage, Frame, Intrinsics, align, nearby, settle
 from headvox.align import Scratch
 from headvox.data import Expected
-from headvox.kernels import Threads
 from headvox.pose import Poses, all_turns, expected_turns, fit_poses, upright_turns
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
 from headvox.template import load_template
+from headvox.threads import Threads
 
 TEMPLATE = load_template()
 SURE_DEG = 15.0  # a yaw that is stated to this counts as known, see bench/refine.py

@@ -11,6 +11,7 @@ from headvox.data import Cloud, DepthImage, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
 from headvox.voxelize import (
+    ROWS,
     Lattice,
     Marking,
     Rays,
@@ -297,17 +298,18 @@ def test_shares_merge_to_the_whole_and_tell_the_occupied_box(counting):
     image = scenes.image_of_spheres(
         rng, scenes.looking_along_x(-0.9, 0.0, 0.1), [(0.0, 0.0, 0.1, 0.1)], wall_m=1.2
     )
-    rays, (height, width) = Rays.of(image, lattice), image.depth.shape
+    rays, width = Rays.of(image, lattice), image.depth.shape[1]
     size = math.prod(lattice.shape)
     box, grids = new_box(), [np.zeros(size, np.uint32 if counting else np.uint8) for _ in range(2)]
     marking = Marking.of(width)
     common = (lattice.limits(), lattice.bits, lattice.shape, 1, counting)
-    for cells, points, rows in (
-        (grids[0], cloud.points[:617], (0, 5)),
-        (grids[1], cloud.points[617:], (5, height)),
+    assert image.depth.shape[0] > ROWS
+    for cells, points, share in (
+        (grids[0], cloud.points[:617], (0, 2)),
+        (grids[1], cloud.points[617:], (1, 2)),
     ):
         mark_points(points, part_transform(cloud, lattice), *common, *marking.for_points(), box, cells)
-        pixels = (image.depth, *rows, rays.column, rays.row, rays.t)
+        pixels = (image.depth, *share, rays.column, rays.row, rays.t)
         mark_depth(*pixels, *common, *marking.for_depth(width), box, cells)
     merge(*grids, counting)
     assert not grids[1].any()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -32,19 +34,31 @@ def as_rigid(matrix: npt.ArrayLike, name: str) -> F64:
         raise HeadvoxError(
             f"{name}: expected a 4x4 matrix, got shape {T.shape}.", "Give four rows of four numbers."
         )
-    if not np.isfinite(T).all():
+    # Plain numbers: it is done for each sensor of each frame, and a call of NumPy takes longer than all of it.
+    *rows, last = T.tolist()
+    if not all(map(math.isfinite, [*rows[0], *rows[1], *rows[2], *last])):
         raise HeadvoxError(
             f"{name}: the matrix has NaN or infinite entries.", "An unknown transform is not usable."
         )
-    if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > RIGID_TOLERANCE:
-        raise HeadvoxError(f"{name}: the last row is {T[3].tolist()}, expected 0 0 0 1.", "Is it transposed?")
-    R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(R) < 0.0:
+    if max(abs(last[0]), abs(last[1]), abs(last[2]), abs(last[3] - 1.0)) > RIGID_TOLERANCE:
+        raise HeadvoxError(f"{name}: the last row is {last}, expected 0 0 0 1.", "Is it transposed?")
+    if not _is_rotation(*rows):
         raise HeadvoxError(
-            f"{name}: the rotation part is not a rotation (determinant {np.linalg.det(R):.3g}).",
+            f"{name}: the rotation part is not a rotation (determinant {np.linalg.det(T[:3, :3]):.3g}).",
             "Expected an invertible, unscaled, right-handed rotation.",
         )
     return T
+
+
+def _is_rotation(a: list[float], b: list[float], c: list[float]) -> bool:
+    """Return whether the first three numbers of the rows are a rotation: unit length, right angles, right-handed."""
+    (a0, a1, a2, _), (b0, b1, b2, _), (c0, c1, c2, _) = a, b, c
+    off = (
+        a0 * a0 + a1 * a1 + a2 * a2 - 1.0, b0 * b0 + b1 * b1 + b2 * b2 - 1.0, c0 * c0 + c1 * c1 + c2 * c2 - 1.0,
+        a0 * b0 + a1 * b1 + a2 * b2, a0 * c0 + a1 * c1 + a2 * c2, b0 * c0 + b1 * c1 + b2 * c2,
+    )  # fmt: skip
+    determinant = a0 * (b1 * c2 - b2 * c1) - a1 * (b0 * c2 - b2 * c0) + a2 * (b0 * c1 - b1 * c0)
+    return max(map(abs, off)) <= RIGID_TOLERANCE and determinant > 0.0
 
 
 def inverse(T_a_b: F64) -> F64:

@@ -63,21 +63,32 @@ def integrate(cells, box, first, counting, y_first, y_last, spare, row, S):  # t
     for x in range(S.shape[0] - 1):
         for z in range(0, row.shape[0], LANES):
             store(row, z, none)
+        slice_at = ((first[0] + x) * cells.shape[1] + first[1] - 1) * cells.shape[2] + box[2]
         occupied = box[0] <= first[0] + x <= box[3]
-        for y in range(y_last):
-            if occupied and box[1] < first[1] + y <= box[4] + 1:
-                column = ((first[0] + x) * cells.shape[1] + first[1] + y - 1) * cells.shape[2] + box[2]
-                _add_column(grid, column, height, counting, spare, row, bottom)
-            if y >= y_first:
-                before = (x * columns + y) * length
-                after = before + columns * length
-                for z in range(0, length, LANES):
-                    store(flat, after + z, add(load(flat, before + z), load(row, z)))
+        lowest, highest = (
+            box[1] - first[1] + 1,
+            box[4] - first[1] + 1,
+        )  # the columns of S with cells of their own
+        before = min(y_first - 1, highest) - lowest + 1
+        if occupied and before > 0:
+            at = slice_at + lowest * cells.shape[2]
+            _add_many(grid, at, before, cells.shape[2], height, counting, spare, row, bottom)
+        for y in range(y_first, y_last):
+            if occupied and lowest <= y <= highest:
+                at = slice_at + y * cells.shape[2]
+                _add_columns(grid, at, 1, cells.shape[2], height, counting, spare, row, bottom)
+            here = (x * columns + y) * length
+            after = here + columns * length
+            for z in range(0, length, LANES):
+                store(flat, after + z, add(load(flat, here + z), load(row, z)))
 
 
 @rule
-def _add_column(grid, at, height, counting, spare, row, bottom):  # type: ignore[no-untyped-def]
-    """Add to ``row``, from ``bottom`` on, what is in the column that begins at ``at``, up to each of its cells."""
+def _add_columns(grid, at, many, step, height, counting, spare, row, bottom):  # type: ignore[no-untyped-def]
+    """Add to ``row``, from ``bottom`` on, what is in ``many`` columns together, up to each of their cells.
+
+    The first begins at ``at``, the next one a ``step`` further.
+    """
     half = (row.shape[0] - LANES) // 2
     lower, upper = place(bottom, half), place(bottom + 1, half)  # of the first two cells
     lower_end = half if lower < half else 2 * half
@@ -85,15 +96,16 @@ def _add_column(grid, at, height, counting, spare, row, bottom):  # type: ignore
     total = load(row, 0)
     total = sub(total, total)
     for z in range(0, height, 2 * LANES):
-        some, more = (
-            _amounts(grid, at, z, height, counting, spare),
-            _amounts(grid, at, z + LANES, height, counting, spare),
-        )
-        second = widen(odds(some, more), total)
-        sums = add(running_sums(add(widen(evens(some, more), total), second)), total)
+        some, more = _amounts(grid, at, z, height, counting, spare)
+        one, other = widen(evens(some, more), total), widen(odds(some, more), total)
+        for column in range(1, many):
+            some, more = _amounts(grid, at + column * step, z, height, counting, spare)
+            one = add(one, widen(evens(some, more), total))
+            other = add(other, widen(odds(some, more), total))
+        sums = add(running_sums(add(one, other)), total)
         k = z // 2
-        before = beginning(sub(sums, second), lower_end - lower - k)
-        store(row, lower + k, add(load(row, lower + k), before))
+        below = beginning(sub(sums, other), lower_end - lower - k)
+        store(row, lower + k, add(load(row, lower + k), below))
         store(row, upper + k, add(load(row, upper + k), beginning(sums, upper_end - upper - k)))
         total = last(sums)
     done = (height + 2 * LANES - 1) // (2 * LANES) * LANES
@@ -103,9 +115,21 @@ def _add_column(grid, at, height, counting, spare, row, bottom):  # type: ignore
         store(row, k, add(load(row, k), beginning(total, upper_end - k)))
 
 
+@bare_kernel
+def _add_many(grid, at, many, step, height, counting, spare, row, bottom):  # type: ignore[no-untyped-def]
+    """As :func:`_add_columns`, which is made anew wherever it is called, for this number of columns or for that."""
+    _add_columns(grid, at, many, step, height, counting, spare, row, bottom)
+
+
 @rule
 def _amounts(grid, at, z, height, counting, spare):  # type: ignore[no-untyped-def]
-    """Return what the cells ``z`` to ``z + LANES`` of a column hold, 0 from ``height`` on."""
+    """Return what two vectors of cells of a column hold, from ``z`` on: 0 from ``height`` on."""
+    some = _amount(grid, at, z, height, counting, spare)
+    return some, _amount(grid, at, z + LANES, height, counting, spare)
+
+
+@rule
+def _amount(grid, at, z, height, counting, spare):  # type: ignore[no-untyped-def]
     if at + z + LANES <= grid.shape[0]:
         cells = load(grid, at + z)
     else:

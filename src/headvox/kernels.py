@@ -1,8 +1,8 @@
-"""The one way a loop is compiled, and the threads that run it.
+"""The one way a loop is compiled.
 
 Every kernel is a module-level function with ``@kernel``: compiled once, cached on disk beside its source file.
-Loops release the GIL, so a frame is split over plain threads: the same compiled loop runs on a part of the rows,
-whatever the number of threads, and integer results make the split invisible in the output.
+Loops release the GIL, so a frame is split over plain threads (:mod:`headvox.threads`): the same compiled loop runs on a
+part of the rows, whatever the number of threads, and integer results make the split invisible in the output.
 
 Kernels and rules have no type hints, and say so to the type checker: one serves arrays of several integer types, and
 Numba infers them. The public function beside each has them.
@@ -11,13 +11,9 @@ Numba infers them. The public function beside each has them.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
-from queue import SimpleQueue
-from threading import Thread
 from typing import Any
-from weakref import finalize
 
 import numba
 import numpy as np
@@ -85,63 +81,3 @@ def product(a, b):  # type: ignore[no-untyped-def]
     there, another function stands for it (see :mod:`headvox.cuda.lanes`), and the bits are the same everywhere.
     """
     return a * b
-
-
-class Threads:
-    """A fixed number of threads that run one call each; with one thread it runs in the caller and costs nothing."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        # A plain queue wakes a thread in a few microseconds, a pool of the standard library in tens of them.
-        self._calls: _Calls = SimpleQueue()
-        self._others = [
-            Thread(target=_serve, args=(self._calls,), name="headvox", daemon=True) for _ in range(count - 1)
-        ]
-        for thread in self._others:
-            thread.start()
-        self._end = finalize(self, _end, self._calls, count - 1)
-
-    def run(self, function: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> None:
-        """Call ``function`` with each of ``calls``; returns, or raises, when all have ended."""
-        ends: SimpleQueue[BaseException | None] = SimpleQueue()
-        own = 1 if self._others else len(calls)
-        for arguments in calls[own:]:
-            self._calls.put((partial(function, *arguments), ends))
-        try:
-            for arguments in calls[:own]:
-                function(*arguments)
-        finally:
-            errors = [ends.get() for _ in calls[own:]]  # nobody may still write when the caller goes on
-        for error in errors:
-            if error is not None:
-                raise error
-
-    def close(self) -> None:
-        """End the threads."""
-        self._end()
-        for thread in self._others:
-            thread.join()
-        self._others = []
-
-
-_Calls = SimpleQueue[tuple[Callable[[], None], SimpleQueue[BaseException | None]] | None]
-
-
-def _serve(calls: _Calls) -> None:
-    while call := calls.get():
-        function, ends = call
-        ends.put(_error_of(function))
-        del call, function, ends  # what they refer to may be large
-
-
-def _error_of(function: Callable[[], None]) -> BaseException | None:
-    try:
-        function()
-    except BaseException as error:
-        return error
-    return None
-
-
-def _end(calls: _Calls, threads: int) -> None:
-    for _ in range(threads):
-        calls.put(None)

@@ -54,7 +54,7 @@ class Memory:
         whole = np.array([0, lattice.shape[0], 0, lattice.shape[1], 0, lattice.shape[2]])
         self.passed = np.empty(math.prod(shape_of_passed(whole)), np.uint32)
         self.survivors = np.empty((4096, 3), np.int32)
-        self.points = np.empty((MOST_PARTS, 3))
+        self.points = [np.empty((MOST_PARTS, 3)) for _ in range(threads)]
         self.unseen = np.zeros((1, 1, 2), np.int32)
         self.sees = cascade.source.sees  # asks every tree: not for every frame
         self.search = Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
@@ -74,8 +74,8 @@ class Memory:
 
     def candidates_about(self, occupied: I64) -> I64:
         """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""
-        box = occupied + self.candidate_reach
-        return np.concatenate([np.maximum(box[:3], 0), np.minimum(box[3:], np.array(self.lattice.shape) - 1)])
+        box: I64 = np.minimum(np.maximum(occupied + self.candidate_reach, 0), self.last_cells)
+        return box
 
     def centres(self, cells: I32) -> F64:
         """Return the world centres (N, 3) of ``cells`` (N, 3) of the integral volume."""
@@ -84,7 +84,8 @@ class Memory:
     def place(self, lattice: Lattice) -> None:
         """Stand for another region of the same shape."""
         self.lattice = lattice
-        self.limits = lattice.limits()
+        self.limits, self.bits, self.odd = lattice.limits(), lattice.bits, lattice.odd
+        self.last_cells = np.tile(np.array(lattice.shape) - 1, 2)
 
     def make_room_for_width(self, pixels: int) -> None:
         """Have room for images as wide as that."""

@@ -23,7 +23,7 @@ from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners, shape_with_margins
 from headvox.keep import asks_cameras, keep, least_score, slack_of
-from headvox.kernels import Threads, read_only
+from headvox.kernels import read_only
 from headvox.memory import Memory, Stages
 from headvox.placing import Placing
 from headvox.pose import fit_poses
@@ -31,7 +31,8 @@ from headvox.read_masks import load_cascade
 from headvox.refine import fit_spheres
 from headvox.simd import LANES
 from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, local_maxima
-from headvox.visibility import camera_table, count_states, look_about
+from headvox.threads import Threads
+from headvox.visibility import count_states, look_about
 from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import (
     mark_depth,
@@ -45,7 +46,7 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
-FEW = 512
+FEW = 128
 """Candidates that are scored before a second thread would have begun."""
 
 
@@ -117,27 +118,28 @@ class Detector:
         """
         if self.on_device:
             return self._detect_on_device([frame], [expected])[0]
-        check_frame(frame)
-        clock = Clock(self.stage_ms)
-        memory = self._memory_for(frame)
-        memory.clear()
-        occupied = self._voxelize(frame, memory)
-        clock.done("voxelize")
-        candidates = memory.candidates_about(occupied)
-        S = self._integrate(memory, occupied, candidates)
-        clock.done("integral")
-        survivors = self._gate(S, candidates, memory)
-        clock.done("gate")
-        scores = self._vote(S, survivors, memory)
-        clock.done("vote")
-        self._looked_at = (memory, survivors, scores)
-        peaks = self._suppress(S, survivors, scores, memory)
-        clock.done("suppress")
-        cells, scores, peaks, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
-        clock.done("judge")
-        heads = self._refine(frame, cells, scores, peaks, least, memory, expected)
-        clock.done("refine")
-        return heads
+        with self._threads.awake():
+            check_frame(frame)
+            clock = Clock(self.stage_ms)
+            memory = self._memory_for(frame)
+            memory.clear()
+            occupied = self._voxelize(frame, memory)
+            clock.done("voxelize")
+            candidates = memory.candidates_about(occupied)
+            S = self._integrate(memory, occupied, candidates)
+            clock.done("integral")
+            survivors = self._gate(S, candidates, memory)
+            clock.done("gate")
+            scores = self._vote(S, survivors, memory)
+            clock.done("vote")
+            self._looked_at = (memory, survivors, scores)
+            peaks = self._suppress(S, survivors, scores, memory)
+            clock.done("suppress")
+            cells, scores, peaks, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
+            clock.done("judge")
+            heads = self._refine(frame, cells, scores, peaks, least, memory, expected)
+            clock.done("refine")
+            return heads
 
     def detect_batch(self, frames: Sequence[Frame]) -> list[Heads]:
         """Return the heads in each of ``frames``, as :meth:`detect_frame` does; on a GPU, several go at once.
@@ -192,6 +194,7 @@ class Detector:
         limits, shape, shift = memory.limits, lattice.shape, lattice.subdivision - 1
         counting = self.cascade.source.counting
         boxes = [new_box() for _ in range(parts)]
+        views = [self._placing.view(image, lattice) for image in frame.depths]
         memory.make_room_for_width(max((image.depth.shape[1] for image in frame.depths), default=0))
 
         def mark(part: int) -> None:
@@ -204,7 +207,7 @@ class Detector:
                     points[low:high],
                     T,
                     limits,
-                    lattice.bits,
+                    memory.bits,
                     shape,
                     shift,
                     counting,
@@ -212,16 +215,17 @@ class Detector:
                     box,
                     cells,
                 )
-            for image in frame.depths:
-                rays, depth = self._placing.rays(image, lattice), read_only(image.depth)
-                low, high = _share(depth.shape[0], part, parts)
+            for image, (rays, _) in zip(frame.depths, views, strict=True):
+                depth = read_only(image.depth)
                 mark_depth(
-                    depth, low, high, rays.column, rays.row, rays.t, limits, lattice.bits, shape, shift, counting,
+                    depth, part, parts, rays.column, rays.row, rays.t, limits, memory.bits, shape, shift, counting,
                     *marking.for_depth(depth.shape[1]), box, cells,
                 )  # fmt: skip
 
         self._threads.run(mark, [(part,) for part in range(parts)])
-        box = np.concatenate([np.min(boxes, axis=0)[:3], np.max(boxes, axis=0)[3:]])
+        box = boxes[0]
+        for other in boxes[1:]:
+            box[:3], box[3:] = np.minimum(box[:3], other[:3]), np.maximum(box[3:], other[3:])
         memory.dirty = (max(int(box[0]), 0), int(box[3]) + 1)
         if box[3] < 0:
             memory.dirty = (0, 0)
@@ -242,25 +246,24 @@ class Detector:
         shape = shape_with_margins(tuple((candidates[3:] - candidates[:3] + 1).tolist()), memory.reach)
         S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
         memory.first = candidates[:3] + memory.reach[0::2]
-        parts = self._threads.count
 
-        def add_up(part: int) -> None:
-            low, high = (_first_column(shape[1], k, parts) for k in (part, part + 1))
+        def add_up(part: int, low: int, high: int) -> None:
             integrate(
                 memory.cells[0], occupied, memory.first, self.cascade.source.counting, low, high,
                 memory.spare[part], memory.row[part][: shape[2] + LANES], S,
             )  # fmt: skip
 
-        self._threads.run(add_up, [(part,) for part in range(parts)])
+        self._threads.run(add_up, _shares(shape[1], self._threads.count))
         return S
 
     def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: Memory) -> I32:
         parts = self._threads.count
         low, high = candidates[:3] - memory.first, candidates[3:] - memory.first + 1
-        region = np.stack([low, high], axis=1).reshape(-1)
+        region = np.empty(6, np.int64)
+        region[0::2], region[1::2] = low, high
         shape = shape_of_passed(region)
         passed = memory.passed[: math.prod(shape)].reshape(shape)
-        odd = memory.lattice.odd + memory.first
+        odd = memory.odd + memory.first
         set_corners(S, self.cascade.gate.boxes, memory.gate_corners)
 
         def sweep(part: int) -> None:
@@ -277,19 +280,18 @@ class Detector:
 
     def _vote(self, S: npt.NDArray[Any], survivors: I32, memory: Memory) -> I64:
         memory.make_room(len(survivors))
-        scores, parts = memory.scores[: len(survivors)], self._threads.count
+        scores = memory.scores[: len(survivors)]
         votes = self.cascade.votes
         if memory.search is not None:
             self._score(S, survivors, memory.unseen, memory.search, memory, scores)
         elif votes is not None:
             table = (votes.boxes, votes.weights, votes.start, votes.masks, votes.pairs)
 
-            def vote(part: int) -> None:
-                low, high = _share(len(survivors), part, parts)
+            def vote(_: int, low: int, high: int) -> None:
                 limits = (votes.asymmetry_cost, votes.min_votes)
                 vote_masks(S, survivors, low, high, *table, *limits, scores, memory.yaws)
 
-            self._threads.run(vote, [(part,) for part in range(parts)])
+            self._threads.run(vote, _shares(len(survivors), self._threads.count))
         return scores
 
     def _score(
@@ -297,20 +299,17 @@ class Detector:
         all_stages: bool = False,
     ) -> None:  # fmt: skip
         """Write the score of each of ``cells`` by ``stages``; by those that ask nothing of the cameras, if not all."""
-        parts, compiled = self._threads.count, stages.compiled
+        compiled = stages.compiled
         last = len(compiled.stage_keep) if all_stages else compiled.occupied_stages
         set_corners(S, compiled.boxes, stages.corners)
 
-        def score(part: int) -> None:
-            low, high = _share(len(cells), part, parts)
+        def score(part: int, low: int, high: int) -> None:
             vote_stages(
                 S, cells, seen, low, high, last, *stages.tables, stages.corners, memory.alive, *stages.memory[part],
                 scores,
             )  # fmt: skip
 
-        if len(cells) < FEW:
-            parts = 1
-        self._threads.run(score, [(part,) for part in range(parts)])
+        self._threads.run(score, _shares(len(cells), 1 if len(cells) < FEW else self._threads.count))
 
     def _suppress(self, S: npt.NDArray[Any], survivors: I32, scores: I64, memory: Memory) -> I64:
         shape = tuple(n - 1 for n in S.shape)
@@ -352,10 +351,10 @@ class Detector:
         self._score(S, about, memory.unseen, judge, memory, scores)
         best = np.arange(len(cells)) * len(around) + scores.reshape(len(cells), -1).argmax(axis=1)
         best = best[scores[best] > DROPPED]
-        _, ny, nz = S.shape
-        place = (about[best, 0].astype(np.int64) * ny + about[best, 1]) * nz + about[best, 2]
-        _, first = np.unique(place, return_index=True)  # neighbours may meet at the same voxel
-        best = best[np.sort(first)]
+        places: dict[tuple[int, ...], int] = {}  # neighbours may meet at the same voxel
+        for i, cell in zip(best.tolist(), about[best].tolist(), strict=True):
+            places.setdefault(tuple(cell), i)
+        best = np.fromiter(places.values(), np.int64, len(places))
         return about[best], scores[best], best // len(around)
 
     def _look_about(
@@ -364,11 +363,17 @@ class Detector:
         """Return the scores of all stages of the judge, with what the cameras saw empty and hidden."""
         states = np.zeros((len(cells), len(judge.offsets)), np.uint8)
         in_lattice = cells + memory.first.astype(np.int32)
-        for image in frame.depths:
-            table = camera_table(image, memory.lattice)
-            look_about(read_only(image.depth), table, in_lattice, judge.offsets, states)
         seen = np.empty((len(cells), len(judge.offset_start) - 1, 2), np.int32)
-        count_states(states, judge.offset_start, seen)
+        views = [self._placing.view(image, memory.lattice) for image in frame.depths]
+
+        def look(_: int, low: int, high: int) -> None:
+            for image, (__, table) in zip(frame.depths, views, strict=True):
+                look_about(
+                    read_only(image.depth), table, in_lattice[low:high], judge.offsets, states[low:high]
+                )
+            count_states(states[low:high], judge.offset_start, seen[low:high])
+
+        self._threads.run(look, _shares(len(cells), self._threads.count))
         scores = np.empty(len(cells), np.int64)
         self._score(S, cells, seen, judge, memory, scores, all_stages=True)
         return scores
@@ -400,15 +405,14 @@ class Detector:
         spheres = np.empty((len(cells), 6))
         lattice, counting = memory.lattice, self.cascade.source.counting
         in_lattice = cells + memory.first.astype(np.int32)
-        fit_spheres(
-            memory.cells[0],
-            in_lattice,
-            lattice.voxel_m,
-            lattice.subdivision,
-            counting,
-            memory.points,
-            spheres,
-        )
+
+        def fit(part: int, low: int, high: int) -> None:
+            fit_spheres(
+                memory.cells[0], in_lattice[low:high], lattice.voxel_m, lattice.subdivision, counting,
+                memory.points[part], spheres[low:high],
+            )  # fmt: skip
+
+        self._threads.run(fit, _shares(len(cells), self._threads.count))
         return spheres
 
     # -------------------------------------------------------------------------------------------- working memory
@@ -429,14 +433,13 @@ def _warn(text: str) -> None:
     warnings.warn(f"headvox: {text}", RuntimeWarning, stacklevel=4)
 
 
-def _first_column(columns: int, part: int, parts: int) -> int:
-    """Return where a thread's share of the integral volume begins.
-
-    Each adds up the columns before its own, too, which takes as long as writing as many: later shares are smaller.
-    """
-    return round(columns * (1.0 - 0.5**part) / (1.0 - 0.5**parts))
-
-
 def _share(count: int, part: int, parts: int) -> tuple[int, int]:
     """Return the half-open range of ``count`` things that the ``part``-th of ``parts`` threads does."""
-    return count * part // parts, count * (part + 1) // parts
+    first, after = (-(-count * k // parts) for k in (part, part + 1))
+    return first, after
+
+
+def _shares(count: int, parts: int) -> list[tuple[int, int, int]]:
+    """Return part, first and end of the ``count`` things that each of ``parts`` threads does, if it does any."""
+    parts = min(parts, count)
+    return [(part, *_share(count, part, parts)) for part in range(parts)]

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
+from typing import NamedTuple
 
 from headvox.check import origins_of
 from headvox.compile_masks import CompiledCascade
 from headvox.config import DetectorConfig
-from headvox.data import DepthImage, Frame
+from headvox.data import F32, DepthImage, Frame, Intrinsics
 from headvox.fuse import Region
+from headvox.visibility import camera_table
 from headvox.voxelize import Lattice, Rays
 
 
+class View(NamedTuple):
+    """A depth camera in a lattice: its pixels there, and the cells in its image."""
+
+    rays: Rays
+    table: F32
+    """see :func:`headvox.visibility.camera_table`"""
+
+
 class Placing:
-    """Lattices and rays, made anew only when a sensor moved."""
+    """Lattices and views, made anew only when a sensor moved."""
 
     def __init__(self, config: DetectorConfig) -> None:
         self.config = config
         self._lattice: Lattice | None = None
-        self._rays: dict[str, tuple[DepthImage, Lattice, Rays]] = {}
+        self._views: dict[str, tuple[Intrinsics, bytes, Lattice, View]] = {}
 
     def lattice(self, frame: Frame, cascade: CompiledCascade) -> Lattice:
         """Return the lattice that ``cascade`` searches ``frame`` in; the same object while its region is the same.
@@ -41,17 +48,15 @@ class Placing:
             centre = (x, y, z)
         return Region(centre, config.max_range_m, config.min_height_m, config.max_height_m)
 
+    def view(self, image: DepthImage, lattice: Lattice) -> View:
+        """Return where the camera of ``image`` sees the cells of ``lattice``."""
+        lens, place = image.intrinsics, image.T_world_camera.tobytes()
+        known = self._views.get(image.name)
+        if known is None or known[:2] != (lens, place) or known[2] is not lattice:
+            view = View(Rays.of(image, lattice), camera_table(image, lattice))
+            known = self._views[image.name] = (lens, place, lattice, view)
+        return known[3]
+
     def rays(self, image: DepthImage, lattice: Lattice) -> Rays:
         """Return the rays of the pixels of ``image`` in ``lattice``."""
-        known = self._rays.get(image.name)
-        if known is not None:
-            same, placed, rays = known
-            if (
-                placed is lattice
-                and same.intrinsics == image.intrinsics
-                and np.array_equal(same.T_world_camera, image.T_world_camera)
-            ):
-                return rays
-        rays = Rays.of(image, lattice)
-        self._rays[image.name] = (replace(image, T_world_camera=image.T_world_camera.copy()), lattice, rays)
-        return rays
+        return self.view(image, lattice).rays

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from headvox.align import Scratch
 from headvox.data import F64, Expected, Frame
-from headvox.kernels import Threads
 from headvox.nearby import gather, sensors_of
 from headvox.settle import expect_turns, fit_head
 from headvox.template import load_template
+from headvox.threads import Threads
 
 YAWS = 10
 

@@ -69,10 +69,27 @@ def suppress(cells: I32, scores: I64, least: int, shape: tuple[int, ...], reach:
     return peaks[:found]
 
 
+@kernel
+def _keep_apart(centres, order, distance2, kept):  # type: ignore[no-untyped-def]
+    count = 0
+    for i in order:
+        apart = True
+        for k in range(count):
+            j = kept[k]
+            dx, dy, dz = (
+                centres[i, 0] - centres[j, 0],
+                centres[i, 1] - centres[j, 1],
+                centres[i, 2] - centres[j, 2],
+            )
+            apart &= dx * dx + dy * dy + dz * dz >= distance2
+        if apart:
+            kept[count] = i
+            count += 1
+    return count
+
+
 def suppress_overlaps(centres: F64, scores: npt.NDArray[np.generic], distance_m: float) -> I64:
     """Return the indices to keep, best score first, so that no two centres (N, 3) are closer than ``distance_m``."""
-    kept: list[int] = []
-    for i in np.argsort(-scores.astype(np.float64), kind="stable"):
-        if all(np.sum((centres[i] - centres[j]) ** 2) >= distance_m**2 for j in kept):
-            kept.append(int(i))
-    return np.array(kept, np.int64)
+    order = np.argsort(-scores.astype(np.float64), kind="stable")
+    kept = np.empty(len(order), np.int64)
+    return kept[: _keep_apart(np.ascontiguousarray(centres), order, distance_m * distance_m, kept)]

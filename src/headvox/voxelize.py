@@ -50,6 +50,7 @@ FARTHEST = np.int32(2**31 - 1)
 MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
 MOST_BITS = 32  # and so do a part's x, y and z side by side
 ALL = np.uint32(0xFFFFFFFF)
+ROWS = 32  # of an image that one thread takes at a time
 MOST_NEW = 4096  # codes that are entered at a time
 
 Cells = npt.NDArray[np.uint8] | npt.NDArray[np.uint32]
@@ -254,8 +255,8 @@ def mark_points(points, T, limits, bits, shape, shift, counting, codes, new, few
 @bare_kernel
 def mark_depth(  # type: ignore[no-untyped-def]
     depth,
-    first,
-    last,
+    part,
+    parts,
     column,
     row,
     t,
@@ -271,32 +272,35 @@ def mark_depth(  # type: ignore[no-untyped-def]
     box,
     cells,
 ):
-    """As :func:`mark_points`, for rows ``first`` to ``last`` (exclusive) of a depth image, see :class:`Rays`.
+    """As :func:`mark_points`, for the ``part``-th of ``parts`` shares of a depth image, see :class:`Rays`.
 
     A pixel's neighbours are the one before it, the one above, and the next to that.
     """
     flat, width = depth.reshape(-1), depth.shape[1]
-    codes[:] = NOWHERE
     count = 0
-    for v in range(first, last):
-        left = fill(NOWHERE)
-        for u in range(0, width, LANES):
-            if u + LANES <= width:
-                raw = load(flat, v * width + u)
-            else:
-                few[:] = 0
-                for k in range(width - u):
-                    few[k] = flat[v * width + u + k]
-                raw = load(few, 0)
-            far = to_float(raw)
-            x = along_ray(t[0], far, load(column[0], u), row[0, v])
-            y = along_ray(t[1], far, load(column[1], u), row[1, v])
-            z = along_ray(t[2], far, load(column[2], u), row[2, v])
-            known = ~equal(raw, sub(raw, raw))
-            left, count = _mark(x, y, z, known, left, codes, u, limits, bits, counting, new, count)
-            if count > MOST_NEW:
-                enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
-                count = 0
+    # The rows of a share come from all over the image, because some heights are fuller than others.
+    rows = ROWS if parts > 1 else depth.shape[0]
+    for block in range(rows * part, depth.shape[0], rows * parts):
+        codes[:] = NOWHERE
+        for v in range(block, min(block + rows, depth.shape[0])):
+            left = fill(NOWHERE)
+            for u in range(0, width, LANES):
+                if u + LANES <= width:
+                    raw = load(flat, v * width + u)
+                else:
+                    few[:] = 0
+                    for k in range(width - u):
+                        few[k] = flat[v * width + u + k]
+                    raw = load(few, 0)
+                far = to_float(raw)
+                x = along_ray(t[0], far, load(column[0], u), row[0, v])
+                y = along_ray(t[1], far, load(column[1], u), row[1, v])
+                z = along_ray(t[2], far, load(column[2], u), row[2, v])
+                known = ~equal(raw, sub(raw, raw))
+                left, count = _mark(x, y, z, known, left, codes, u, limits, bits, counting, new, count)
+                if count > MOST_NEW:
+                    enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
+                    count = 0
     enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
 
 
@@ -396,10 +400,10 @@ def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cell
 def voxelize_depth(image: DepthImage, lattice: Lattice, count: bool = False) -> Cells:
     """Return the grid of one depth image, without making a cloud; else as :func:`voxelize_points`."""
     cells: npt.NDArray[Any] = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
-    rays, (height, width) = Rays.of(image, lattice), image.depth.shape
+    rays, width = Rays.of(image, lattice), image.depth.shape[1]
     memory = Marking.of(width).for_depth(width)
     mark_depth(
-        image.depth, 0, height, rays.column, rays.row, rays.t, lattice.limits(), lattice.bits, lattice.shape,
+        image.depth, 0, 1, rays.column, rays.row, rays.t, lattice.limits(), lattice.bits, lattice.shape,
         lattice.subdivision - 1, count, *memory, new_box(), cells,
     )  # fmt: skip
     return cells.reshape(lattice.shape)

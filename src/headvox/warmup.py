@@ -16,11 +16,11 @@ from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
-from headvox.kernels import Threads
 from headvox.pipeline import Detector
 from headvox.pose import fit_poses
 from headvox.read_masks import load_cascade
 from headvox.settle import fit_head
+from headvox.threads import Threads
 from headvox.track import Tracker
 
 _ANYTHING = 1 << 40

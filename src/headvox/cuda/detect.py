@@ -17,11 +17,11 @@ from headvox.cuda.device import Device
 from headvox.cuda.readings import Asked, Found
 from headvox.data import F64, Expected, Frame, Heads
 from headvox.keep import asks_cameras, keep, least_score, slack_of
-from headvox.kernels import Threads
 from headvox.placing import Placing
 from headvox.pose import fit_poses
 from headvox.refine import MOST_PARTS, cells_about, fit_spheres
 from headvox.suppress import AROUND, MOST_PEAKS
+from headvox.threads import Threads
 from headvox.voxelize import Lattice
 
 I64 = npt.NDArray[np.int64]

@@ -1,0 +1,207 @@
+"""Threads that share a frame: they wait for the next loop awake while a frame is searched, and sleep between frames.
+
+A frame is a chain of loops of a fraction of a millisecond each, and waking a thread that sleeps takes a tenth of one.
+So the threads that help look at a flag in memory, in compiled code and without the GIL, until the next loop begins;
+and the caller so waits for them. Both offer their core to whoever else wants it all the while.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, NamedTuple
+from weakref import finalize
+
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba import types
+
+from headvox.kernels import bare_kernel
+from headvox.simd import intrinsic
+
+I64 = npt.NDArray[np.int64]
+
+LINE = 8  # flags of different threads are a cache line apart
+LOOKS = 64  # at a flag, before the core is offered to others
+GRACE = 45  # offers of the core, some 10 us, after which the caller is in its loop and has let go of the GIL
+_offer_core = types.ExternalFunction("sched_yield", types.int32())
+
+
+@intrinsic
+def _told(typingctx, flags, at):  # type: ignore[no-untyped-def]
+    """Return ``flags[at]``, and see whatever was written before it was set."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.load_atomic(_address(context, builder, signature, arguments), "acquire", 8)
+
+    return types.int64(flags, at), emit
+
+
+@intrinsic
+def _tell(typingctx, flags, at, value):  # type: ignore[no-untyped-def]
+    """Set ``flags[at]``, after everything that was written before."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        builder.store_atomic(arguments[2], _address(context, builder, signature, arguments), "release", 8)
+        return context.get_dummy_value()
+
+    return types.void(flags, at, types.int64), emit
+
+
+def _address(context: Any, builder: Any, signature: Any, arguments: Any) -> ir.Value:
+    array = context.make_array(signature.args[0])(context, builder, arguments[0])
+    at = context.cast(builder, arguments[1], signature.args[1], types.intp)
+    address: ir.Value = builder.gep(array.data, [at])
+    return address
+
+
+@bare_kernel
+def begin(flags, turn):  # type: ignore[no-untyped-def]
+    """Tell the others that it is their ``turn``."""
+    _tell(flags, 0, turn)
+
+
+@bare_kernel
+def finish(flags, thread, turn):  # type: ignore[no-untyped-def]
+    """Tell the caller that this thread has done its ``turn``, and wait for the next one."""
+    _tell(flags, LINE * thread, turn)
+    _wait(flags, 0, turn + 1)
+    for _ in range(GRACE):
+        _offer_core()
+
+
+@bare_kernel
+def join(flags, others, turn):  # type: ignore[no-untyped-def]
+    """Wait until all others have done their ``turn``, of which they are told again."""
+    _tell(flags, 0, turn)
+    for thread in range(1, others + 1):
+        _wait(flags, LINE * thread, turn)
+
+
+@bare_kernel
+def _wait(flags, at, turn):  # type: ignore[no-untyped-def]
+    looks = 0
+    while _told(flags, at) < turn:
+        looks += 1
+        if looks % LOOKS == 0:
+            _offer_core()
+
+
+class _Task(NamedTuple):
+    turn: int
+    function: Callable[..., None] | None
+    """None sends the threads to sleep."""
+    calls: Sequence[tuple[Any, ...]]
+
+
+class _Shared:
+    """What the threads know of each other: they must not hold the :class:`Threads`, which end when nobody does."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.flags: I64 = np.zeros(LINE * count, np.int64)
+        self.task = _Task(0, None, ())
+        self.errors: list[BaseException | None] = [None] * count
+        self.alarms: list[SimpleQueue[int | None]] = [SimpleQueue() for _ in range(count)]
+
+
+class Threads:
+    """A fixed number of threads that run one call each; with one thread it runs in the caller and costs nothing."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._awake = False
+        self._start()
+
+    def _start(self) -> None:
+        self._process = os.getpid()
+        self._shared = _Shared(self.count)
+        self._others = [
+            Thread(target=_serve, args=(self._shared, k), name="headvox", daemon=True)
+            for k in range(1, self.count)
+        ]
+        for thread in self._others:
+            thread.start()
+        self._end = finalize(self, _ring, self._shared, None)
+
+    @contextmanager
+    def awake(self) -> Iterator[None]:
+        """Have the threads wait awake for what they are to run; they sleep again at the end."""
+        if self._awake or not self._others:
+            yield
+            return
+        if self._process != os.getpid():  # a process that was forked has none of its parent's threads
+            self._end.detach()
+            self._start()
+        self._awake = True
+        try:
+            _ring(self._shared, self._shared.task.turn)
+            yield
+        finally:
+            self._awake = False
+            begin(self._shared.flags, self._hand_out(None, ()))
+
+    def run(self, function: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> None:
+        """Call ``function`` with each of ``calls``; returns, or raises, when all have ended."""
+        if not self._others or len(calls) < 2:
+            for arguments in calls:
+                function(*arguments)
+            return
+        with self.awake():
+            shared = self._shared
+            shared.errors = [None] * self.count
+            turn = self._hand_out(function, calls)
+            try:
+                begin(shared.flags, turn)
+                for arguments in calls[:: self.count]:
+                    function(*arguments)
+            finally:
+                join(shared.flags, len(self._others), turn)  # nobody may still write when the caller goes on
+        for error in shared.errors:
+            if error is not None:
+                raise error
+
+    def _hand_out(self, function: Callable[..., None] | None, calls: Sequence[tuple[Any, ...]]) -> int:
+        """Say what is to be run next; return its turn."""
+        turn = self._shared.task.turn + 1
+        self._shared.task = _Task(turn, function, calls)
+        return turn
+
+    def close(self) -> None:
+        """End the threads."""
+        self._end()
+        for thread in self._others:
+            thread.join()
+        self._others = []
+
+
+def _ring(shared: _Shared, turn: int | None) -> None:
+    """Wake the threads for what comes after ``turn``, or end them."""
+    for alarm in shared.alarms[1:]:
+        alarm.put(turn)
+
+
+def _serve(shared: _Shared, thread: int) -> None:
+    done = 0
+    while (turn := shared.alarms[thread].get()) is not None:
+        asleep = turn < done  # it was still awake when it was to be woken
+        while not asleep:
+            finish(shared.flags, thread, done)
+            done, asleep = _take_turn(shared, thread)
+
+
+def _take_turn(shared: _Shared, thread: int) -> tuple[int, bool]:
+    """Do this thread's share of what was handed out last; return its turn, and whether that was to sleep."""
+    turn, function, calls = shared.task
+    if function is None:
+        return turn, True
+    try:
+        for arguments in calls[thread :: shared.count]:
+            function(*arguments)
+    except BaseException as error:
+        shared.errors[thread] = error
+    return turn, False

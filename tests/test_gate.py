@@ -232,8 +232,8 @@ def test_shares_of_a_part_of_the_volume_are_together_that_part(spacing, shape):
                 gate_columns(
                     S,
                     region,
-                    part,
-                    parts,
+                    S.shape[1] * part // parts,
+                    S.shape[1] * (part + 1) // parts,
                     *gate_tables(gate, S.dtype),
                     spacing,
                     odd + margin,

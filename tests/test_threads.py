@@ -4,9 +4,20 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
-from headvox.threads import Threads
+from headvox.kernels import bare_kernel
+from headvox.threads import Threads, take
+
+
+@bare_kernel
+def take_all(counts, taken):
+    """Count each of ``taken`` (N,) that is taken."""
+    i = take(counts, 0)
+    while i < taken.shape[0]:
+        taken[i] += 1
+        i = take(counts, 0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -136,3 +147,11 @@ threads.close()
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 def test_a_forked_process_makes_threads_of_its_own():
     subprocess.run([sys.executable, "-c", FORK], check=True, timeout=100)
+
+
+def test_what_is_taken_is_taken_once():
+    threads, counts, taken = Threads(2), np.zeros(1, np.int64), np.zeros(1_000_000, np.int64)
+    threads.run(take_all, [(counts, taken), (counts, taken)])
+    threads.close()
+    assert (taken == 1).all()
+    assert counts[0] == len(taken) + 2

@@ -18,6 +18,7 @@ from headvox.voxelize import (
     mark_depth,
     mark_points,
     merge,
+    new_blocks,
     new_box,
     part_transform,
     voxelize_depth,
@@ -303,13 +304,16 @@ def test_shares_merge_to_the_whole_and_tell_the_occupied_box(counting):
     box, grids = new_box(), [np.zeros(size, np.uint32 if counting else np.uint8) for _ in range(2)]
     marking = Marking.of(width)
     common = (lattice.limits(), lattice.bits, lattice.shape, 1, counting)
+    first, rest = new_blocks(2)
+    rest[0] = 1  # the first block of rows was taken by the other
     assert image.depth.shape[0] > ROWS
-    for cells, points, share in (
-        (grids[0], cloud.points[:617], (0, 2)),
-        (grids[1], cloud.points[617:], (1, 2)),
+    for cells, points, depth, blocks in (
+        (grids[0], cloud.points[:617], image.depth[:ROWS], first),
+        (grids[1], cloud.points[617:], image.depth, rest),
     ):
-        mark_points(points, part_transform(cloud, lattice), *common, *marking.for_points(), box, cells)
-        pixels = (image.depth, *share, rays.column, rays.row, rays.t)
+        T = part_transform(cloud, lattice)
+        mark_points(points, new_blocks(1)[0], T, *common, *marking.for_points(), box, cells)
+        pixels = (depth, blocks, rays.column, rays.row, rays.t)
         mark_depth(*pixels, *common, *marking.for_depth(width), box, cells)
     merge(*grids, counting)
     assert not grids[1].any()
@@ -330,6 +334,7 @@ def test_nothing_in_range_leaves_the_box_empty():
     T = part_transform(Cloud("c", points), lattice)
     mark_points(
         points,
+        new_blocks(1)[0],
         T,
         lattice.limits(),
         lattice.bits,

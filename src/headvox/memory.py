@@ -18,7 +18,7 @@ from headvox.refine import MOST_PARTS
 from headvox.simd import LANES
 from headvox.visibility import cells_of
 from headvox.vote import StageTables, seen_boxes
-from headvox.voxelize import Lattice, Marking
+from headvox.voxelize import Lattice, Marking, empty
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
@@ -63,14 +63,15 @@ class Memory:
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 
-    def clear(self) -> None:
-        """Empty the grid of the last frame: now, so that the cells are in the cache when they are marked."""
-        if self.dirty is None:  # a frame was interrupted midway, and has left something anywhere
-            for cells in self.cells:
-                cells[:] = 0
-        else:
-            self.cells[0][self.dirty[0] : self.dirty[1]] = 0
-        self.dirty = None
+    def clear(self, part: int, dirty: tuple[int, int] | None) -> None:
+        """Empty a thread's grid, of which the slices ``dirty`` are not: all, if a frame was interrupted midway.
+
+        It does so just before it marks the cells: they are in its cache then.
+        """
+        if dirty is None:
+            empty(self.flat[part])
+        elif part == 0:  # the others' were emptied when they were merged
+            empty(self.cells[0][dirty[0] : dirty[1]].reshape(-1))
 
     def candidates_about(self, occupied: I64) -> I64:
         """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""

@@ -38,6 +38,7 @@ from headvox.voxelize import (
     mark_depth,
     mark_points,
     merge,
+    new_blocks,
     new_box,
     part_transform,
 )
@@ -122,7 +123,6 @@ class Detector:
             check_frame(frame)
             clock = Clock(self.stage_ms)
             memory = self._memory_for(frame)
-            memory.clear()
             occupied = self._voxelize(frame, memory)
             clock.done("voxelize")
             candidates = memory.candidates_about(occupied)
@@ -197,30 +197,19 @@ class Detector:
         views = [self._placing.view(image, lattice) for image in frame.depths]
         memory.make_room_for_width(max((image.depth.shape[1] for image in frame.depths), default=0))
 
+        blocks = new_blocks(len(frame.clouds) + len(frame.depths))
+        dirty, memory.dirty = memory.dirty, None
+
         def mark(part: int) -> None:
+            memory.clear(part, dirty)
+            common = (limits, memory.bits, shape, shift, counting)
             cells, marking, box = memory.flat[part], memory.marking[part], boxes[part]
-            for cloud in frame.clouds:
-                points = read_only(cloud.points)
-                low, high = _share(len(points), part, parts)
+            for cloud, taken in zip(frame.clouds, blocks, strict=False):
                 T = part_transform(cloud, lattice)
-                mark_points(
-                    points[low:high],
-                    T,
-                    limits,
-                    memory.bits,
-                    shape,
-                    shift,
-                    counting,
-                    *marking.for_points(),
-                    box,
-                    cells,
-                )
-            for image, (rays, _) in zip(frame.depths, views, strict=True):
-                depth = read_only(image.depth)
-                mark_depth(
-                    depth, part, parts, rays.column, rays.row, rays.t, limits, memory.bits, shape, shift, counting,
-                    *marking.for_depth(depth.shape[1]), box, cells,
-                )  # fmt: skip
+                mark_points(read_only(cloud.points), taken, T, *common, *marking.for_points(), box, cells)
+            for image, (rays, _), taken in zip(frame.depths, views, blocks[len(frame.clouds) :], strict=True):
+                depth, room = read_only(image.depth), marking.for_depth(image.depth.shape[1])
+                mark_depth(depth, taken, rays.column, rays.row, rays.t, *common, *room, box, cells)
 
         self._threads.run(mark, [(part,) for part in range(parts)])
         box = boxes[0]
@@ -257,7 +246,6 @@ class Detector:
         return S
 
     def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: Memory) -> I32:
-        parts = self._threads.count
         low, high = candidates[:3] - memory.first, candidates[3:] - memory.first + 1
         region = np.empty(6, np.int64)
         region[0::2], region[1::2] = low, high
@@ -266,12 +254,13 @@ class Detector:
         odd = memory.odd + memory.first
         set_corners(S, self.cascade.gate.boxes, memory.gate_corners)
 
-        def sweep(part: int) -> None:
+        def sweep(_: int, low: int, high: int) -> None:
             gate_columns(
-                S, region, part, parts, *memory.gate, self.cascade.gate.spacing, odd, memory.gate_corners, passed
+                S, region, low, high, *memory.gate, self.cascade.gate.spacing, odd, memory.gate_corners, passed
             )  # fmt: skip
 
-        self._threads.run(sweep, [(part,) for part in range(parts)])
+        # The columns that a thread has added up: they are in its own cache.
+        self._threads.run(sweep, _shares(S.shape[1], self._threads.count))
         self.candidates = list_passed(passed, region, memory.survivors)
         if self.candidates > len(memory.survivors):
             memory.survivors = np.empty((2 * self.candidates, 3), np.int32)

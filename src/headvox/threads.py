@@ -52,6 +52,17 @@ def _tell(typingctx, flags, at, value):  # type: ignore[no-untyped-def]
     return types.void(flags, at, types.int64), emit
 
 
+@intrinsic
+def take(typingctx, counts, at):  # type: ignore[no-untyped-def]
+    """Return ``counts[at]`` and count on, in one step: no two threads get the same."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        one = ir.Constant(ir.IntType(64), 1)
+        return builder.atomic_rmw("add", _address(context, builder, signature, arguments), one, "monotonic")
+
+    return types.int64(counts, at), emit
+
+
 def _address(context: Any, builder: Any, signature: Any, arguments: Any) -> ir.Value:
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
     at = context.cast(builder, arguments[1], signature.args[1], types.intp)

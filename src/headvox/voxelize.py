@@ -44,13 +44,14 @@ from headvox.simd import (
     to_int,
     where,
 )  # fmt: skip
+from headvox.threads import take
 
 NOWHERE = np.int32(-1)
 FARTHEST = np.int32(2**31 - 1)
 MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
 MOST_BITS = 32  # and so do a part's x, y and z side by side
 ALL = np.uint32(0xFFFFFFFF)
-ROWS = 32  # of an image that one thread takes at a time
+ROWS, POINTS = 32, 1 << 14  # that a thread takes at a time
 MOST_NEW = 4096  # codes that are entered at a time
 
 Cells = npt.NDArray[np.uint8] | npt.NDArray[np.uint32]
@@ -131,6 +132,11 @@ class Lattice:
 def new_box() -> npt.NDArray[np.int64]:
     """Return an empty box of cells: lowest and highest in x, y, z."""
     return np.array([FARTHEST, FARTHEST, FARTHEST, NOWHERE, NOWHERE, NOWHERE], dtype=np.int64)
+
+
+def new_blocks(readings: int) -> npt.NDArray[np.int64]:
+    """Return how many blocks were taken of each reading: (readings, 1)."""
+    return np.zeros((readings, 1), np.int64)
 
 
 @rule
@@ -228,35 +234,40 @@ def enter(new, count, bits, shape, shift, counting, box, codes, cells):  # type:
 
 
 @bare_kernel
-def mark_points(points, T, limits, bits, shape, shift, counting, codes, new, few, few_codes, box, cells):  # type: ignore[no-untyped-def]
+def mark_points(  # type: ignore[no-untyped-def]
+    points, blocks, T, limits, bits, shape, shift, counting, codes, new, few, few_codes, box, cells
+):
     """Enter ``points`` (N, 3) into the flat grid ``cells``, and widen ``box``, see :func:`new_box`.
 
+    Points are taken :data:`POINTS` at a time by whichever thread is free: ``blocks`` (1,) counts what was taken.
     ``codes``, ``new`` and ``few`` are working memory, see :class:`Marking`.
     """
-    xyz = points.reshape(-1)
-    codes[:] = NOWHERE  # the grid may have been emptied since
-    left, count = fill(NOWHERE), 0
-    for at in range(0, xyz.shape[0], 3 * LANES):
-        if at + 3 * LANES <= xyz.shape[0]:
-            px, py, pz = load_triples(xyz, at)
-        else:
-            few[:] = np.nan
-            for k in range(xyz.shape[0] - at):
-                few[k] = xyz[at + k]
-            px, py, pz = load_triples(few, 0)
-        x, y, z = moved(T, 0, px, py, pz), moved(T, 1, px, py, pz), moved(T, 2, px, py, pz)
-        left, count = _mark(x, y, z, ALL, left, codes, 0, limits, bits, counting, new, count)
-        if count > MOST_NEW:
-            enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
-            count = 0
+    xyz, count = points.reshape(-1), 0
+    first = 3 * POINTS * take(blocks, 0)
+    while first < xyz.shape[0]:
+        codes[:] = NOWHERE  # the grid may have been emptied since
+        left = fill(NOWHERE)
+        for at in range(first, min(first + 3 * POINTS, xyz.shape[0]), 3 * LANES):
+            if at + 3 * LANES <= xyz.shape[0]:
+                px, py, pz = load_triples(xyz, at)
+            else:
+                few[:] = np.nan
+                for k in range(xyz.shape[0] - at):
+                    few[k] = xyz[at + k]
+                px, py, pz = load_triples(few, 0)
+            x, y, z = moved(T, 0, px, py, pz), moved(T, 1, px, py, pz), moved(T, 2, px, py, pz)
+            left, count = _mark(x, y, z, ALL, left, codes, 0, limits, bits, counting, new, count)
+            if count > MOST_NEW:
+                enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
+                count = 0
+        first = 3 * POINTS * take(blocks, 0)
     enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
 
 
 @bare_kernel
 def mark_depth(  # type: ignore[no-untyped-def]
     depth,
-    part,
-    parts,
+    blocks,
     column,
     row,
     t,
@@ -272,17 +283,15 @@ def mark_depth(  # type: ignore[no-untyped-def]
     box,
     cells,
 ):
-    """As :func:`mark_points`, for the ``part``-th of ``parts`` shares of a depth image, see :class:`Rays`.
+    """As :func:`mark_points`, for a depth image, :data:`ROWS` at a time; see :class:`Rays`.
 
     A pixel's neighbours are the one before it, the one above, and the next to that.
     """
-    flat, width = depth.reshape(-1), depth.shape[1]
-    count = 0
-    # The rows of a share come from all over the image, because some heights are fuller than others.
-    rows = ROWS if parts > 1 else depth.shape[0]
-    for block in range(rows * part, depth.shape[0], rows * parts):
+    flat, height, width, count = depth.reshape(-1), depth.shape[0], depth.shape[1], 0
+    first = ROWS * take(blocks, 0)
+    while first < height:
         codes[:] = NOWHERE
-        for v in range(block, min(block + rows, depth.shape[0])):
+        for v in range(first, min(first + ROWS, height)):
             left = fill(NOWHERE)
             for u in range(0, width, LANES):
                 if u + LANES <= width:
@@ -301,7 +310,14 @@ def mark_depth(  # type: ignore[no-untyped-def]
                 if count > MOST_NEW:
                     enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
                     count = 0
+        first = ROWS * take(blocks, 0)
     enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
+
+
+@bare_kernel
+def empty(cells):  # type: ignore[no-untyped-def]
+    """Clear a flat grid."""
+    cells[:] = 0
 
 
 @bare_kernel
@@ -392,7 +408,8 @@ def voxelize_points(cloud: Cloud, lattice: Lattice, count: bool = False) -> Cell
     cells: npt.NDArray[Any] = np.zeros(math.prod(lattice.shape), dtype=np.uint32 if count else np.uint8)
     T, limits, memory = part_transform(cloud, lattice), lattice.limits(), Marking.of(LANES).for_points()
     mark_points(
-        cloud.points, T, limits, lattice.bits, lattice.shape, lattice.subdivision - 1, count, *memory, new_box(), cells
+        cloud.points, new_blocks(1)[0], T, limits, lattice.bits, lattice.shape, lattice.subdivision - 1, count, *memory,
+        new_box(), cells,
     )  # fmt: skip
     return cells.reshape(lattice.shape)
 
@@ -403,7 +420,7 @@ def voxelize_depth(image: DepthImage, lattice: Lattice, count: bool = False) -> 
     rays, width = Rays.of(image, lattice), image.depth.shape[1]
     memory = Marking.of(width).for_depth(width)
     mark_depth(
-        image.depth, 0, 1, rays.column, rays.row, rays.t, lattice.limits(), lattice.bits, lattice.shape,
+        image.depth, new_blocks(1)[0], rays.column, rays.row, rays.t, lattice.limits(), lattice.bits, lattice.shape,
         lattice.subdivision - 1, count, *memory, new_box(), cells,
     )  # fmt: skip
     return cells.reshape(lattice.shape)

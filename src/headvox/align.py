@@ -95,11 +95,17 @@ class Scratch(NamedTuple):
 
 
 @rule
+def evenly(s, used, there):  # type: ignore[no-untyped-def]
+    """Return which row of all that are ``there`` is the ``s``-th of those that are ``used``."""
+    return (2 * s + 1) * there // (2 * used)
+
+
+@rule
 def choose(source, there, target, most):  # type: ignore[no-untyped-def]
     """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many."""
     used = min(there, most)
     for s in range(used):
-        at = (2 * s + 1) * there // (2 * used)
+        at = evenly(s, used, there)
         for j in range(source.shape[1]):
             target[s, j] = source[at, j]
     return used
@@ -254,12 +260,12 @@ def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, 
             for s in range(count, whole):
                 J[i, s] = 0.0
         _accumulate(J, whole, size, A)
-        _add_priors(state, modes, upright, A)
+        add_priors(state, modes, upright, A)
     return 0.5 * cost
 
 
 @rule
-def _add_priors(state, modes, upright, A):  # type: ignore[no-untyped-def]
+def add_priors(state, modes, upright, A):  # type: ignore[no-untyped-def]
     """Add the priors on place, size, shape and, if ``upright``, on pitch and roll."""
     w = 1.0 / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
     for i in range(3):
@@ -306,25 +312,31 @@ def solve(A, x, size):  # type: ignore[no-untyped-def]
 
 
 @rule
+def invert_column(A, x, c):  # type: ignore[no-untyped-def]
+    """Leave column ``c`` of (L Lᵀ)⁻¹ in ``x``, L the lower half of A."""
+    for i in range(PARAMETERS):
+        v = 1.0 if i == c else 0.0
+        for q in range(i):
+            v -= A[i, q] * x[q]
+        x[i] = v / A[i, i]
+    for i in range(PARAMETERS - 1, -1, -1):
+        v = x[i]
+        for q in range(i + 1, PARAMETERS):
+            v -= A[q, i] * x[q]
+        x[i] = v / A[i, i]
+
+
+@rule
 def _invert(A, x, covariance):  # type: ignore[no-untyped-def]
-    """Write the first 6x6 of (L Lᵀ)⁻¹ to ``covariance``, L the lower half of A: shift and turn, all else unknown."""
+    """Write the first 6x6 of the inverse to ``covariance``: of shift and turn, all else unknown."""
     for c in range(6):
-        for i in range(PARAMETERS):
-            v = 1.0 if i == c else 0.0
-            for q in range(i):
-                v -= A[i, q] * x[q]
-            x[i] = v / A[i, i]
-        for i in range(PARAMETERS - 1, -1, -1):
-            v = x[i]
-            for q in range(i + 1, PARAMETERS):
-                v -= A[q, i] * x[q]
-            x[i] = v / A[i, i]
+        invert_column(A, x, c)
         for i in range(6):
             covariance[i, c] = x[i]
 
 
 @rule
-def _move(state, x, size):  # type: ignore[no-untyped-def]
+def move(state, x, size):  # type: ignore[no-untyped-def]
     """Take the step ``x``, cut to a bearable length."""
     step = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
     turn = np.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
@@ -363,7 +375,7 @@ def explore(work, used, starts, upright, template):  # type: ignore[no-untyped-d
             )  # fmt: skip
             if steps:
                 solve(A, x, 7 + modes)
-                _move(state, x, 7 + modes)
+                move(state, x, 7 + modes)
 
 
 @bare_kernel
@@ -382,7 +394,7 @@ def refine(work, used, rays, upright, template, at):  # type: ignore[no-untyped-
         )  # fmt: skip
         told[EVIDENCE] = cost + solve(A, x, 7 + modes)
         if step < FINE_STEPS:
-            _move(state, x, 7 + modes)
+            move(state, x, 7 + modes)
     _invert(A, x, work.covariances[at])
 
 

@@ -22,11 +22,26 @@ SURFACE_SIGMA_M = 0.012
 STEPS = 10
 HAIR_M = 0.0135  # the median over 710 simulated heads, with one camera (553) and with several alike
 MOST_PARTS = 8192
+RADIUS, RMS, COUNT = 3, 4, 5  # what a row says of a sphere, behind its centre
 
 
 def cells_about(voxel_m: float) -> int:
     """Return how many cells about a voxel, to each side, :func:`fit_spheres` looks at."""
     return math.ceil(REACH_M / voxel_m)
+
+
+# The sums of a step: the upper triangle of A, row by row, b, and the weighted squares and the weights.
+TRIANGLE, RIGHT, SQUARES, WEIGHTS, SUMS = 0, 10, 14, 15, 16
+
+
+@rule
+def part_at(a, b, c, part, voxel_m, part_m):  # type: ignore[no-untyped-def]
+    """Return where a part of the voxel ``a, b, c`` away lies, and whether it counts; metres from the voxel's centre."""
+    px = (a - 0.5) * voxel_m + ((part >> 2 & 1) + 0.5) * part_m
+    py = (b - 0.5) * voxel_m + ((part >> 1 & 1) + 0.5) * part_m
+    pz = (c - 0.5) * voxel_m + ((part & 1) + 0.5) * part_m
+    counts = px * px + py * py + pz * pz <= REACH_M * REACH_M and pz >= -BELOW_M
+    return px, py, pz, counts
 
 
 @rule
@@ -44,16 +59,60 @@ def _gather(cells, x, y, z, voxel_m, subdivision, counting, points):  # type: ig
                 bits = 1 if counting else int(value)
                 for part in range(8):
                     if bits >> part & 1:
-                        px = (a - x - 0.5) * voxel_m + ((part >> 2 & 1) + 0.5) * part_m
-                        py = (b - y - 0.5) * voxel_m + ((part >> 1 & 1) + 0.5) * part_m
-                        pz = (c - z - 0.5) * voxel_m + ((part & 1) + 0.5) * part_m
-                        near = px * px + py * py + pz * pz <= REACH_M * REACH_M
-                        if near and pz >= -BELOW_M and found < points.shape[0]:
+                        px, py, pz, counts = part_at(a - x, b - y, c - z, part, voxel_m, part_m)
+                        if counts and found < points.shape[0]:
                             points[found, 0] = px
                             points[found, 1] = py
                             points[found, 2] = pz
                             found += 1
     return found
+
+
+@rule
+def add_priors(sphere, sums):  # type: ignore[no-untyped-def]
+    """Add to ``sums`` what is known of a head's place and size; ``sphere`` is x, y, z and the radius."""
+    centre = SURFACE_SIGMA_M * SURFACE_SIGMA_M / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
+    radius = SURFACE_SIGMA_M * SURFACE_SIGMA_M / (RADIUS_SIGMA_M * RADIUS_SIGMA_M)
+    sums[TRIANGLE] += centre
+    sums[TRIANGLE + 4] += centre
+    sums[TRIANGLE + 7] += centre
+    sums[TRIANGLE + 9] += radius
+    for i in range(3):
+        sums[RIGHT + i] += -centre * sphere[i]
+    sums[RIGHT + 3] += radius * (RADIUS_M - sphere[3])
+
+
+@rule
+def add_part(px, py, pz, sphere, sums):  # type: ignore[no-untyped-def]
+    """Add to ``sums`` what a part says of ``sphere``."""
+    dx, dy, dz = px - sphere[0], py - sphere[1], pz - sphere[2]
+    distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
+    residual = distance - sphere[3]
+    weight = 1.0 / (1.0 + residual * residual / (SURFACE_SIGMA_M * SURFACE_SIGMA_M))
+    j = (-dx / distance, -dy / distance, -dz / distance, -1.0)
+    at = TRIANGLE
+    for row in range(4):
+        for column in range(row, 4):
+            sums[at] += weight * j[row] * j[column]
+            at += 1
+        sums[RIGHT + row] -= weight * j[row] * residual
+    sums[SQUARES] += weight * residual * residual
+    sums[WEIGHTS] += weight
+
+
+@rule
+def take_step(sums, A, b, sphere):  # type: ignore[no-untyped-def]
+    """Move ``sphere`` by what ``sums`` say, and return how far the parts lie from it (rms); A and b are scrap."""
+    at = TRIANGLE
+    for row in range(4):
+        for column in range(row, 4):
+            A[row, column] = A[column, row] = sums[at]
+            at += 1
+        b[row] = sums[RIGHT + row]
+    _solve(A, b)
+    for i in range(4):
+        sphere[i] += b[i]
+    return np.sqrt(sums[SQUARES] / max(sums[WEIGHTS], 1e-9))
 
 
 @rule
@@ -77,53 +136,16 @@ def fit_spheres(cells, peaks, voxel_m, subdivision, counting, points, spheres): 
 
     Gauss-Newton on the residuals |p - c| - r, weighted 1 / (1 + (residual / sigma)²), with Gaussian priors.
     """
-    A = np.empty((4, 4))
-    b = np.empty(4)
+    A, b, sums = np.empty((4, 4)), np.empty(4), np.empty(SUMS)
     for i in range(peaks.shape[0]):
         count = _gather(cells, peaks[i, 0], peaks[i, 1], peaks[i, 2], voxel_m, subdivision, counting, points)
-        cx = cy = cz = 0.0
-        r = RADIUS_M
-        rms = 0.0
-        sigma2 = SURFACE_SIGMA_M * SURFACE_SIGMA_M
+        sphere = spheres[i]
+        sphere[:] = 0.0
+        sphere[RADIUS] = RADIUS_M
         for _ in range(STEPS):
-            A[:] = 0.0
-            centre_prior = sigma2 / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
-            radius_prior = sigma2 / (RADIUS_SIGMA_M * RADIUS_SIGMA_M)
-            A[0, 0] = A[1, 1] = A[2, 2] = centre_prior
-            A[3, 3] = radius_prior
-            b[0], b[1], b[2] = -centre_prior * cx, -centre_prior * cy, -centre_prior * cz
-            b[3] = radius_prior * (RADIUS_M - r)
-            squares = weights = 0.0
+            sums[:] = 0.0
+            add_priors(sphere, sums)
             for k in range(count):
-                dx, dy, dz = points[k, 0] - cx, points[k, 1] - cy, points[k, 2] - cz
-                distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
-                residual = distance - r
-                weight = 1.0 / (1.0 + residual * residual / sigma2)
-                jx, jy, jz, jr = -dx / distance, -dy / distance, -dz / distance, -1.0
-                A[0, 0] += weight * jx * jx
-                A[0, 1] += weight * jx * jy
-                A[0, 2] += weight * jx * jz
-                A[0, 3] += weight * jx * jr
-                A[1, 1] += weight * jy * jy
-                A[1, 2] += weight * jy * jz
-                A[1, 3] += weight * jy * jr
-                A[2, 2] += weight * jz * jz
-                A[2, 3] += weight * jz * jr
-                A[3, 3] += weight * jr * jr
-                b[0] -= weight * jx * residual
-                b[1] -= weight * jy * residual
-                b[2] -= weight * jz * residual
-                b[3] -= weight * jr * residual
-                squares += weight * residual * residual
-                weights += weight
-            for row in range(4):
-                for column in range(row):
-                    A[row, column] = A[column, row]
-            _solve(A, b)
-            cx += b[0]
-            cy += b[1]
-            cz += b[2]
-            r += b[3]
-            rms = np.sqrt(squares / max(weights, 1e-9))
-        spheres[i, 0], spheres[i, 1], spheres[i, 2] = cx, cy, cz
-        spheres[i, 3], spheres[i, 4], spheres[i, 5] = r, rms, count
+                add_part(points[k, 0], points[k, 1], points[k, 2], sphere, sums)
+            sphere[RMS] = take_step(sums, A, b, sphere)
+        sphere[COUNT] = count

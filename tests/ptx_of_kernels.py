@@ -20,7 +20,8 @@ from headvox.read_masks import load_cascade, parse_cascade
 from headvox.suppress import AROUND
 from headvox.voxelize import Lattice
 
-KERNELS = 19
+KERNELS = 23
+FITS = {"fit_spheres", "gather", "fit_starts", "settle_heads"}  # within a tolerance of the CPU's
 
 
 class OnHost(np.ndarray):
@@ -34,6 +35,8 @@ class OnHost(np.ndarray):
 
 
 def type_of(value):
+    if hasattr(value, "_fields"):
+        return numba.types.NamedTuple([type_of(item) for item in value], type(value))
     if isinstance(value, tuple):
         return numba.types.Tuple([type_of(item) for item in value])
     if isinstance(value, np.ndarray):
@@ -77,10 +80,10 @@ def test_every_kernel_compiles_and_rounds_every_product(compiled):
     ):
         lattice = Lattice.over(scenes.region(), cascade.voxel_m, cascade.subdivision)
         made = compile_cascade(cascade)
-        search = Search(made, lattice.shape, AROUND[made.gate.spacing], 256, 4, 1)
+        search = Search(made, lattice.shape, AROUND[made.gate.spacing], 256, "pose", 1)
         search.run([Asked(frame, lattice, False, 0)], lambda *_: pytest.fail("no camera"))
     assert len({name for name, _ in compiled}) == KERNELS
     for (name, _), text in compiled.items():
         assert ".visible .entry" in text
-        assert not re.search(r"\b(fma|mad)\.(rn\.)?f(32|64)", text), name
+        assert name in FITS or not re.search(r"\b(fma|mad)\.(rn\.)?f(32|64)", text), name
     assert "mul.rn.f32" in next(text for (name, _), text in compiled.items() if name == "mark")

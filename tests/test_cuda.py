@@ -91,6 +91,49 @@ def test_without_numba_cuda_it_says_how_to_install_it(monkeypatch):
     assert not Detector(backend="auto").on_device
 
 
+def fails_with(text):
+    """Return a stand-in for a kernel that the driver does not run."""
+    from numba.cuda.cudadrv.driver import CudaAPIError
+
+    class Kernel:
+        def __getitem__(self, launch):
+            raise CudaAPIError(222, text)
+
+    return Kernel()
+
+
+@pytest.mark.skipif(not INSTALLED, reason="numba-cuda is not installed")
+@pytest.mark.parametrize("available", [True, False])
+def test_a_driver_that_is_too_old_is_a_clear_error(monkeypatch, available):
+    """It may be told at once, or by the first kernel."""
+    from numba import cuda
+
+    from headvox.cuda import compact
+
+    told = "CUDA driver version is insufficient\nfor CUDA runtime version"
+    monkeypatch.setattr(cuda, "is_available", lambda: available)
+    monkeypatch.setattr(cuda, "cuda_error", lambda: None if available else told)
+    monkeypatch.setattr(cuda, "to_device", lambda array: array)
+    monkeypatch.setattr(cuda, "device_array", lambda shape, dtype: np.empty(shape, dtype))
+    monkeypatch.setattr(compact, "count_bits", fails_with(told))
+    with pytest.raises(HeadvoxError) as error:
+        Detector(backend="cuda")
+    assert "CUDA driver version is insufficient for CUDA runtime version" in error.value.what
+    assert "nvidia-smi" in error.value.do
+    assert "\n" not in error.value.what + error.value.do
+    assert not Detector(backend="auto").on_device
+
+
+@pytest.mark.skipif(not INSTALLED, reason="numba-cuda is not installed")
+def test_what_comes_from_the_driver_is_told_from_our_own_faults():
+    from numba.cuda.cudadrv import driver, error
+
+    for of_device in (driver.CudaAPIError(719, "gone"), error.CudaSupportError("none")):
+        assert device._is_of_device(of_device)
+    for ours in (KeyError("a"), MemoryError(), HeadvoxError("a", "b"), ValueError("c")):
+        assert not device._is_of_device(ours)
+
+
 @without_gpu
 def test_the_commands_end_with_1_and_one_clear_line(capsys):
     for command in (["run", "--limit", "1", "--backend", "cuda"], ["bench", "--backend", "cuda"]):

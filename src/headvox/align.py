@@ -131,7 +131,7 @@ def _accumulate(J, count, size, A):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
+def add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
     """Add to A what one more row with the residual ``e`` says, which knows of the turn alone."""
     A[3, 3] += weight * wx * wx
     A[3, 4] += weight * wx * wy
@@ -279,8 +279,8 @@ def add_priors(state, modes, upright, A):  # type: ignore[no-untyped-def]
         A[7 + i, RESIDUAL] += state[13 + i]
     if upright:
         ux, uy, uz = state[9], state[10], state[11]
-        _add_turn(A, 0.0, -uz, uy, ux, 1.0 / (PITCH_SIGMA * PITCH_SIGMA))
-        _add_turn(A, uz, 0.0, -ux, uy, 1.0 / (ROLL_SIGMA * ROLL_SIGMA))
+        add_turn(A, 0.0, -uz, uy, ux, 1.0 / (PITCH_SIGMA * PITCH_SIGMA))
+        add_turn(A, uz, 0.0, -ux, uy, 1.0 / (ROLL_SIGMA * ROLL_SIGMA))
 
 
 @bare_kernel

@@ -27,24 +27,22 @@ def heads_at(
     ``spheres`` (N, 6) were fitted about the voxels (:func:`headvox.refine.fit_spheres`); ``haired`` says that they lie
     on hair, not on the skull. ``yaws`` (N,) are in radians, if known. Heads that score ``least`` are sure.
     """
-    count = len(centres)
-    radii = np.full(count, RADIUS_M)
+    radii = np.full(len(centres), RADIUS_M)
     if spheres is not None:
         centres, radii = centres + spheres[:, :3], spheres[:, 3]
         if haired:
             centres[:, 2] -= HAIR_M
-    quaternions = np.full((count, 4), np.nan)
-    if yaws is not None:
-        half = 0.5 * yaws
-        quaternions = np.stack([np.zeros(count), np.zeros(count), np.sin(half), np.cos(half)], axis=1)
     kept = suppress_overlaps(centres, scores, SAME_HEAD_M)
-    return Heads(
-        centres[kept],
-        quaternions[kept],
-        radii[kept],
-        scores[kept] / SCORE_UNIT,
-        sure=scores[kept] >= least,
-    )
+    return stated(centres[kept], radii[kept], scores[kept], least, None if yaws is None else yaws[kept])
+
+
+def stated(centres: F64, radii: F64, scores: I64, least: int, yaws: F64 | None) -> Heads:
+    """Return heads of which this is known: see :func:`heads_at`."""
+    quaternions = np.full((len(centres), 4), np.nan)
+    if yaws is not None:
+        half, none = 0.5 * yaws, np.zeros(len(yaws))
+        quaternions = np.stack([none, none, np.sin(half), np.cos(half)], axis=1)
+    return Heads(centres, quaternions, radii, scores / SCORE_UNIT, sure=scores >= least)
 
 
 def with_poses(heads: Heads, poses: Poses) -> Heads:

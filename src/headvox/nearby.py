@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64, Frame
+from headvox.data import F64, DepthImage, Frame
 from headvox.kernels import bare_kernel, read_only, rule
 from headvox.simd import LANES, add, below, fill, load_triples, lowest, mul, sub
 
@@ -32,7 +32,7 @@ UNKNOWN_SIGMA_M = 0.002  # of points whose sensor nobody knows
 
 
 @rule
-def _view(T, x, y, z, length, out, at):  # type: ignore[no-untyped-def]
+def view(T, x, y, z, length, out, at):  # type: ignore[no-untyped-def]
     """Write the unit direction of the sensor's ray x, y, z to out[at, 3:6]."""
     out[at, 3] = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) / length
     out[at, 4] = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) / length
@@ -40,7 +40,7 @@ def _view(T, x, y, z, length, out, at):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _place(T, along, out, at):  # type: ignore[no-untyped-def]
+def place(T, along, out, at):  # type: ignore[no-untyped-def]
     """Write the point ``along`` metres on the ray of out[at, 3:6] to out[at, :3]."""
     for i in range(3):
         out[at, i] = out[at, 3 + i] * along + T[i, 3]
@@ -57,7 +57,7 @@ def _thin(buffer, first, end):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _window(middle, depth, reach, focal, centre, size):  # type: ignore[no-untyped-def]
+def window(middle, depth, reach, focal, centre, size):  # type: ignore[no-untyped-def]
     """Return the first and the last-but-one pixel, along one axis of an image, that a ball covers."""
     near, far = depth - reach, depth + reach
     if near < 0.05:
@@ -78,8 +78,8 @@ def window_of(lens, T, reach, height, width, most):  # type: ignore[no-untyped-d
     ox = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
     oy = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
     oz = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
-    u0, u1 = _window(ox, oz, reach, fx, cx, width)
-    v0, v1 = _window(oy, oz, reach, fy, cy, height)
+    u0, u1 = window(ox, oz, reach, fx, cx, width)
+    v0, v1 = window(oy, oz, reach, fy, cy, height)
     if oz < -reach:
         u1, v1 = u0, v0
     stride = 1
@@ -113,8 +113,8 @@ def look_at_pixel(raw, u, v, lens, origin, reach):  # type: ignore[no-untyped-de
 @rule
 def keep_pixel(T, x, y, z, length, lens, samples, n):  # type: ignore[no-untyped-def]
     """Write what :func:`look_at_pixel` told of a pixel to samples[n]."""
-    _view(T, x, y, 1.0, length, samples, n)
-    _place(T, z * length, samples, n)
+    view(T, x, y, 1.0, length, samples, n)
+    place(T, z * length, samples, n)
     samples[n, 6] = DEPTH_SIGMA_M + DEPTH_SIGMA_PER_M * z * z
     samples[n, 7] = PIXEL_SIGMA * z / lens[0]
 
@@ -136,8 +136,8 @@ def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  #
                 keep_pixel(T, x, y, z, length, lens, samples, n)
                 n += 1
             elif kind == PASSES and m < most_m:
-                _view(T, x, y, 1.0, length, rays, m)
-                _place(T, along, rays, m)
+                view(T, x, y, 1.0, length, rays, m)
+                place(T, along, rays, m)
                 m += 1
     return n, m
 
@@ -214,7 +214,7 @@ def keep_passing(T, x, y, z, squared, along, rays, m):  # type: ignore[no-untype
     """Write what :func:`look_at_point` told of a point whose ray passes by to rays[m]."""
     length = np.sqrt(squared)
     rays[m, 3], rays[m, 4], rays[m, 5] = x / length, y / length, z / length
-    _place(T, along / length, rays, m)
+    place(T, along / length, rays, m)
 
 
 @bare_kernel
@@ -270,13 +270,18 @@ class Sensor(NamedTuple):
     """whether the sensor is at the origin of its coordinates"""
 
 
+def lens_of(image: DepthImage) -> F64:
+    """Return fx, fy, cx, cy and the depth scale, (5,)."""
+    c = image.intrinsics
+    return np.array([c.fx, c.fy, c.cx, c.cy, c.depth_scale])
+
+
 def sensors_of(frame: Frame) -> list[Sensor]:
     """Return the images and the clouds of ``frame``."""
-    sensors = []
-    for image in frame.depths:
-        c = image.intrinsics
-        lens = np.array([c.fx, c.fy, c.cx, c.cy, c.depth_scale])
-        sensors.append(Sensor(read_only(image.depth), _rigid(image.T_world_camera), lens, True))
+    sensors = [
+        Sensor(read_only(image.depth), _rigid(image.T_world_camera), lens_of(image), True)
+        for image in frame.depths
+    ]
     for cloud in frame.clouds:
         knows = cloud.T_world_sensor is not None
         T = _rigid(np.eye(4) if cloud.T_world_sensor is None else cloud.T_world_sensor)

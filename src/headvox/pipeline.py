@@ -173,7 +173,7 @@ class Detector:
     def _detect_on_device(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
         """Return the heads in up to :data:`BATCH` frames by the GPU; where it failed, by the CPU, and from then on."""
         if self.on_device:
-            self.device = self.device or OnDevice(self.config, self.cascade, self._threads)
+            self.device = self.device or OnDevice(self.config, self.cascade)
             try:
                 heads = self.device.detect(frames, expected, self.stage_ms)
                 self.candidates = self.device.candidates

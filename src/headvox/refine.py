@@ -109,14 +109,14 @@ def take_step(sums, A, b, sphere):  # type: ignore[no-untyped-def]
             A[row, column] = A[column, row] = sums[at]
             at += 1
         b[row] = sums[RIGHT + row]
-    _solve(A, b)
+    solve(A, b)
     for i in range(4):
         sphere[i] += b[i]
     return np.sqrt(sums[SQUARES] / max(sums[WEIGHTS], 1e-9))
 
 
 @rule
-def _solve(A, b):  # type: ignore[no-untyped-def]
+def solve(A, b):  # type: ignore[no-untyped-def]
     """Solve the 4x4 positive definite A x = b in place, by elimination; x is left in ``b``."""
     for i in range(4):
         for j in range(i + 1, 4):

@@ -102,9 +102,9 @@ def settle(work, refined, best, centre, template, poses, i):  # type: ignore[no-
     poses.radii[i] = template.radius_m * np.exp(state[12])
     whole = 0.0
     for s in range(refined):
-        whole += _odds(work.told, s, best, template.temperature)
+        whole += odds(work.told, s, best, template.temperature)
     for s in range(refined):
-        share = _odds(work.told, s, best, template.temperature) / whole
+        share = odds(work.told, s, best, template.temperature) / whole
         other = work.fine[s]
         if s == best or not share > 0.0:
             continue
@@ -127,7 +127,7 @@ def settle(work, refined, best, centre, template, poses, i):  # type: ignore[no-
 
 
 @rule
-def _odds(told, s, best, temperature):  # type: ignore[no-untyped-def]
+def odds(told, s, best, temperature):  # type: ignore[no-untyped-def]
     """Return how probable state ``s`` is, the best being 1; 0 for one whose evidence is not a number."""
     odds = np.exp((told[best, EVIDENCE] - told[s, EVIDENCE]) / temperature)
     return odds if np.isfinite(odds) else 0.0
@@ -138,9 +138,9 @@ def turn_between(one, other):  # type: ignore[no-untyped-def]
     """Return the rotation vector, in the axes of state ``one``, that turns its rotation to that of ``other``."""
     # R1ᵀ R2: column c of R1 times column d of R2
     x, y, z, w = quaternion_of(
-        _column(one, 0, other, 0), _column(one, 0, other, 1), _column(one, 0, other, 2),
-        _column(one, 1, other, 0), _column(one, 1, other, 1), _column(one, 1, other, 2),
-        _column(one, 2, other, 0), _column(one, 2, other, 1), _column(one, 2, other, 2),
+        column(one, 0, other, 0), column(one, 0, other, 1), column(one, 0, other, 2),
+        column(one, 1, other, 0), column(one, 1, other, 1), column(one, 1, other, 2),
+        column(one, 2, other, 0), column(one, 2, other, 1), column(one, 2, other, 2),
     )  # fmt: skip
     sine = np.sqrt(x * x + y * y + z * z)
     if sine < 1e-9:
@@ -152,7 +152,7 @@ def turn_between(one, other):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _column(one, c, other, d):  # type: ignore[no-untyped-def]
+def column(one, c, other, d):  # type: ignore[no-untyped-def]
     """Return the product of two columns of the rotations in two states."""
     return one[3 + c] * other[3 + d] + one[6 + c] * other[6 + d] + one[9 + c] * other[9 + d]
 

@@ -107,13 +107,13 @@ class Device:
         shape: tuple[int, int, int],
         around: npt.NDArray[np.int32],
         most_peaks: int,
-        patch_reach: int,
+        refines: str,
     ) -> None:
         from headvox.cuda.search import Search
 
         self.cascade, self.shape = cascade, shape
         self._searches: dict[int, Search] = {}
-        self._make = partial(Search, cascade, shape, around, most_peaks, patch_reach)
+        self._make = partial(Search, cascade, shape, around, most_peaks, refines)
 
     def for_frames(self, count: int) -> Search:
         """Return the search for so many frames at once."""
@@ -133,7 +133,10 @@ class Device:
         except Exception as error:
             if not _is_of_device(error):
                 raise
-            raise DeviceLost(" ".join(str(error).split()) or type(error).__name__) from error
+            told = " ".join(str(error).split()) or type(error).__name__
+            if "OUT_OF_MEMORY" in told:
+                told += "; it has too little memory: a smaller max_range_m or larger voxels need less"
+            raise DeviceLost(told) from error
 
 
 def _is_of_device(error: Exception) -> bool:

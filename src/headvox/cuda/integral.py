@@ -36,24 +36,12 @@ def sum_along_z(cells, counting, S):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sum_along_y(S):  # type: ignore[no-untyped-def]
-    """Add to each entry of ``S`` all before it along y."""
+def sum_along(S):  # type: ignore[no-untyped-def]
+    """Add to each entry of ``S`` (frames, A, N, B) all before it along the third axis."""
     frame, length = cuda.blockIdx.y, S.shape[3]
     for i in range(cuda.grid(1), S.shape[1] * length, cuda.gridsize(1)):
-        x, z = i // length, i % length
+        a, b = i // length, i % length
         total = np.int64(0)
-        for y in range(S.shape[2]):
-            total += S[frame, x, y, z]
-            S[frame, x, y, z] = total
-
-
-@kernel
-def sum_along_x(S):  # type: ignore[no-untyped-def]
-    """Add to each entry of ``S`` all before it along x."""
-    frame, length = cuda.blockIdx.y, S.shape[3]
-    for i in range(cuda.grid(1), S.shape[2] * length, cuda.gridsize(1)):
-        y, z = i // length, i % length
-        total = np.int64(0)
-        for x in range(S.shape[1]):
-            total += S[frame, x, y, z]
-            S[frame, x, y, z] = total
+        for n in range(S.shape[2]):
+            total += S[frame, a, n, b]
+            S[frame, a, n, b] = total

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import cuda
 
+from headvox.assemble import MOST_POSES
 from headvox.cuda.gate import cell_of
-from headvox.cuda.lanes import device, floored, kernel, on_device, product_32
+from headvox.cuda.lanes import floored, kernel, on_device, product_32
 from headvox.cuda.readings import (
     DATA,
     DEPTH,
@@ -17,21 +18,23 @@ from headvox.cuda.readings import (
     SENSOR,
     SENSORS,
     TABLE,
-    THRESHOLD,
     WIDTH,
 )
-from headvox.cuda.suppress import CANDIDATES, JUDGED, KEPT, PEAKS
+from headvox.cuda.suppress import CANDIDATES, HEADS, JUDGED, PEAKS
+from headvox.data import F64
+from headvox.pose import Poses
 from headvox.visibility import EMPTY, HIDDEN, pixel_of, project, state_at
 from headvox.vote import DROPPED
 
 _pixel_of = on_device(pixel_of, project=on_device(project, product=product_32), floored=floored)
 _state_at = on_device(state_at, product=product_32)
 
-# The report of a frame: a few numbers, then a row for each peak that was judged.
+# The report of a frame: a few numbers, then a row for each head, and for the pose of each that has one.
 TOTAL, FOUND, COUNT = 0, 1, 2
 REPORT_HEADER = 4
-PLACE, SCORE, YAW, PATCH = 0, 1, 2, 3
-ROW = 4
+PLACE, SCORE, YAW, SPHERE = 0, 1, 2, 3
+ROW = 7
+POSE = 29
 
 
 @kernel
@@ -117,52 +120,52 @@ def count_states(whole, counts, states, start, seen):  # type: ignore[no-untyped
         seen[frame, n, b, 1] = hidden
 
 
-@device
-def joined(low, high):  # type: ignore[no-untyped-def]
-    """Return the int64 that two int32 are the halves of."""
-    return (np.int64(high) << np.int64(32)) | (np.int64(low) & np.int64(0xFFFFFFFF))
-
-
 @kernel
-def report(S, whole, counts, judged, judged_places, judged_scores, yaws, kept, rows):  # type: ignore[no-untyped-def]
-    """Write a frame's report to ``rows`` (frames, N), and which of the judged are worth a patch to ``kept``.
+def report(  # type: ignore[no-untyped-def]
+    S, counts, judged, judged_places, judged_scores, yaws, kept, heads, spheres, poses, has_poses, rows, real
+):
+    """Write a frame's report to ``rows`` (frames, N), which ``real`` is as float64; a thread a head.
 
-    One thread a frame: the peaks are few.
+    ``poses`` are of the first heads of each frame, :data:`headvox.assemble.MOST_POSES` rows each.
     """
-    frame = cuda.blockIdx.y
-    if cuda.grid(1) > 0:
-        return
-    count = counts[frame, JUDGED]
-    threshold = joined(whole[frame, THRESHOLD], whole[frame, THRESHOLD + 1])
-    rows[frame, TOTAL] = S[frame, S.shape[1] - 1, S.shape[2] - 1, S.shape[3] - 1] > 0
-    rows[frame, FOUND] = counts[frame, CANDIDATES]
-    rows[frame, COUNT] = count
-    found = 0
-    for i in range(count):
-        at, score = REPORT_HEADER + ROW * i, judged_scores[frame, i]
-        rows[frame, at + PLACE] = judged_places[frame, i]
-        rows[frame, at + SCORE] = score
-        rows[frame, at + YAW] = yaws[frame, judged[frame, i]]
-        rows[frame, at + PATCH] = found if score >= threshold else -1
-        if score >= threshold:
-            kept[frame, found] = judged_places[frame, i]
-            found += 1
-    counts[frame, KEPT] = found
+    frame, most = cuda.blockIdx.y, heads.shape[1]
+    count = counts[frame, HEADS]
+    if cuda.grid(1) == 0:
+        rows[frame, TOTAL] = S[frame, S.shape[1] - 1, S.shape[2] - 1, S.shape[3] - 1] > 0
+        rows[frame, FOUND] = counts[frame, CANDIDATES]
+        rows[frame, COUNT] = count
+    for head in range(cuda.grid(1), count, cuda.gridsize(1)):
+        at, i = REPORT_HEADER + ROW * head, heads[frame, head]
+        peak = kept[frame, i]
+        rows[frame, at + PLACE] = judged_places[frame, peak]
+        rows[frame, at + SCORE] = judged_scores[frame, peak]
+        rows[frame, at + YAW] = yaws[frame, judged[frame, peak]]
+        for k in range(4):
+            real[frame, at + SPHERE + k] = spheres[frame, i, k]
+        if head >= MOST_POSES or not has_poses:
+            continue
+        at, i = REPORT_HEADER + ROW * most + POSE * head, frame * MOST_POSES + head
+        real[frame, at], real[frame, at + 1] = poses.radii[i], poses.misfits[i]
+        real[frame, at + 2], real[frame, at + 3] = poses.coverages[i], poses.crossings[i]
+        for k in range(4):
+            real[frame, at + 4 + k] = poses.quaternions[i, k]
+        for a in range(3):
+            real[frame, at + 8 + a] = poses.centres[i, a]
+            for b in range(3):
+                real[frame, at + 11 + 3 * a + b] = poses.centre_covariances[i, a, b]
+                real[frame, at + 20 + 3 * a + b] = poses.rotation_covariances[i, a, b]
 
 
-@kernel
-def copy_patches(S, counts, cells, kept, reach, patches, begin):  # type: ignore[no-untyped-def]
-    """Write the cells within ``reach`` of each kept place to ``patches`` (frames, N), side³ each, from ``begin`` on.
-
-    ``cells`` (frames, N) is the grid as it is on the host, cell by cell. Beyond its edges is 0.
-    """
-    frame, side = cuda.blockIdx.y, 2 * reach + 1
-    volume = S[frame]
-    nx, ny, nz = volume.shape[0] - 1, volume.shape[1] - 1, volume.shape[2] - 1
-    each = side * side * side
-    for i in range(cuda.grid(1), counts[frame, KEPT] * each, cuda.gridsize(1)):
-        n, k = i // each, i % each
-        x, y, z = cell_of(kept[frame, n], volume)
-        x, y, z = x + k // (side * side) - reach, y + k // side % side - reach, z + k % side - reach
-        inside = 0 <= x < nx and 0 <= y < ny and 0 <= z < nz
-        patches[frame, begin + i] = cells[frame, (x * ny + y) * nz + z] if inside else 0
+def poses_of(rows: F64) -> Poses:
+    """Return the poses that are in a report's rows (N, POSE)."""
+    radii, misfits, coverages, crossings = rows[:, :4].T.copy()
+    return Poses(
+        rows[:, 8:11].copy(),
+        rows[:, 4:8].copy(),
+        radii,
+        rows[:, 11:20].reshape(-1, 3, 3).copy(),
+        rows[:, 20:29].reshape(-1, 3, 3).copy(),
+        misfits,
+        coverages,
+        crossings,
+    )

@@ -8,9 +8,10 @@ functions, one thread after the other.
 from __future__ import annotations
 
 import math
+import threading
 import warnings
 from collections.abc import Callable
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,21 @@ def on_device(rule: Loop, **names: object) -> Loop:
     source = rule.py_func  # type: ignore[attr-defined]
     scope = {**source.__globals__, **names}
     return device(FunctionType(source.__code__, scope, source.__name__, source.__defaults__))
+
+
+def _math() -> ModuleType:
+    """Return what stands for NumPy in a rule of one number: NumPy's functions are not there on the device."""
+    if SIMULATED:
+        return np
+    stand_in = ModuleType("math_on_device")
+    for name in ("sqrt", "exp", "log", "sin", "cos", "floor", "ceil", "isfinite", "inf", "nan"):
+        setattr(stand_in, name, getattr(math, name))
+    stand_in.arctan2 = math.atan2  # type: ignore[attr-defined]
+    stand_in.float64, stand_in.int64 = np.float64, np.int64  # type: ignore[attr-defined]
+    return stand_in
+
+
+MATH = _math()
 
 
 @device
@@ -131,6 +147,10 @@ def larger(a, b):  # type: ignore[no-untyped-def]
 
 if SIMULATED:
 
+    def wait_for_block() -> None:
+        """Wait for all threads of the block: the simulator knows cuda.syncthreads in a kernel's own file only."""
+        threading.current_thread().syncthreads()  # type: ignore[attr-defined]
+
     def mul(a, b):  # type: ignore[no-untyped-def]
         """Return a * b."""
         return a * b
@@ -138,6 +158,8 @@ if SIMULATED:
     product_32 = product_64 = mul
 else:
     from numba.cuda import libdevice
+
+    wait_for_block = cuda.syncthreads
 
     # A product that is rounded, whatever it is added to: the compiler may not contract it to a fused operation.
     @device

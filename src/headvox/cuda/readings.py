@@ -2,13 +2,15 @@
 
 Uploaded is everything that the sensors saw in a frame, and where they stand, in one row of a buffer.
 
-A row is read as int32, float32 and uint16 at once; offsets are numbers of items of the type that lies there, and 4x4
-matrices begin at whole quads of words.
+A row is read as int32, float32, float64 and uint16 at once; offsets are numbers of items of the type that lies there.
+4x4 matrices begin at whole quads of words, and expected heads at whole octets of float64.
 
-    header    how many sensors, whether the cameras are asked what they saw, the parity of cell 0, 0, 0, the threshold
-              in two words, and the limits of the region
-    sensors   a record each: what it is, where its readings and rays begin, its size, its transform or place, and its
-              camera's table
+    header    how many sensors, whether the cameras are asked what they saw, the parity of cell 0, 0, 0, the least score
+              that is worth a look in two words, the limits of the region, the least score of a head in two words, where
+              the expected heads are and how many, whether heads have hair, and the lattice's origin
+    sensors   a record each: what it is, where its readings and rays begin, its size, whether it is where its readings
+              say, its transform or place in the grid, its camera's table, its place in the world, and its lens
+    expected  of each head its centre, its quaternion, and its reach
     readings  points as they are; rays (columns, rows) and pixels of a depth image
 """
 
@@ -16,19 +18,35 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import DepthImage, Frame
+from headvox.check import origins_of
+from headvox.data import F64, DepthImage, Expected, Frame
+from headvox.nearby import lens_of
+from headvox.pose import Poses
 from headvox.visibility import camera_table
 from headvox.voxelize import Lattice, Rays, part_transform
 
-SENSORS, SEES, ODD, THRESHOLD, LIMITS = 0, 1, 2, 5, 8
-HEADER = 16
-KIND, DATA, WIDTH, HEIGHT, COLUMN, ROW, TRANSFORM, TABLE = 0, 1, 2, 3, 4, 5, 8, 24
-SENSOR = 40
+SENSORS, SEES, ODD, THRESHOLD, LIMITS, LEAST, EXPECTED, EXPECTED_AT, HAIRED = 0, 1, 2, 5, 8, 14, 16, 17, 18
+ORIGIN = 10  # in float64
+HEADER = 32
+KIND, DATA, WIDTH, HEIGHT, COLUMN, ROW, KNOWS, TRANSFORM, TABLE, PLACE, LENS = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    8,
+    24,
+    40,
+    64,
+)
+SENSOR = 76
+OCTET = 16  # words of an expected head
 NOTHING, CLOUD, DEPTH = 0, 1, 2
 
 I32 = npt.NDArray[np.int32]
@@ -37,52 +55,62 @@ I64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A frame, where it is searched, and the least score (in steps) that is worth a look at the surface."""
+    """A frame, where it is searched, whether the cameras are asked, and what a head is: see :mod:`headvox.keep`."""
 
     frame: Frame
     lattice: Lattice
     sees: bool
-    threshold: int
+    least: int
+    slack: int = 0
+    expected: Expected | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What the search found in a frame: all integer, and the same as the CPU's.
+    """The heads of a frame (N of them, best score first), and whether anything was in range.
 
-    ``cells`` (N, 3) of the lattice, ``scores`` (N,) in steps and ``yaws`` (N,) are of the peaks that were judged, in
-    the order of the volume. ``patches`` (P, side, side, side) are the cells of the grid about those that score enough,
-    and ``patch_of`` (N,) tells which is whose, or -1.
+    ``cells`` (N, 3) of the lattice, ``scores`` (N,) in steps and ``yaws`` (N,) are integer, and the same as the CPU's.
+    ``centres`` (N, 3) and ``radii`` (N,) are those of the spheres, ``poses`` of the first heads, if they were fitted.
     """
 
     occupied: bool
     candidates: int
     cells: I32
     scores: I64
-    yaws: I32
-    patches: npt.NDArray[Any]
-    patch_of: I64
+    yaws: I64
+    centres: F64
+    radii: F64
+    poses: Poses | None
 
 
-def words_of(frame: Frame) -> int:
-    """Return how many 32-bit words a row for ``frame`` has."""
+def words_of(asked: Asked) -> int:
+    """Return how many 32-bit words a row for a frame has."""
+    frame, expected = asked.frame, OCTET * (1 + (0 if asked.expected is None else len(asked.expected)))
     points = sum(cloud.points.size for cloud in frame.clouds)
     images = 0
     for image in frame.depths:
         height, width = image.depth.shape
         images += 3 * (width + height) + (width * height + 1) // 2
-    return HEADER + SENSOR * (len(frame.clouds) + len(frame.depths)) + points + images
+    return HEADER + SENSOR * (len(frame.clouds) + len(frame.depths)) + expected + points + images
 
 
 def pack(asked: Asked, rays_of: Callable[[DepthImage, Lattice], Rays], row: I32) -> None:
-    """Write everything about a frame to ``row``, which is long enough: see :func:`words_of`."""
+    """Write everything about a frame to ``row``, which is long enough: see :func:`words_of`.
+
+    Images come before clouds, as in :func:`headvox.nearby.sensors_of`.
+    """
     frame, lattice = asked.frame, asked.lattice
-    real, half = row.view(np.float32), row.view(np.uint16)
+    real, wide, half = row.view(np.float32), row.view(np.float64), row.view(np.uint16)
     row[SENSORS] = len(frame.clouds) + len(frame.depths)
     row[SEES] = asked.sees
     row[ODD : ODD + 3] = lattice.odd
-    row[THRESHOLD : THRESHOLD + 2] = np.array([asked.threshold], np.int64).view(np.int32)
+    row[THRESHOLD : THRESHOLD + 2] = np.array([asked.least - asked.slack], np.int64).view(np.int32)
+    row[LEAST : LEAST + 2] = np.array([asked.least], np.int64).view(np.int32)
     real[LIMITS : LIMITS + 6] = lattice.limits()
-    at, data = HEADER, HEADER + SENSOR * int(row[SENSORS])
+    row[HAIRED] = len(origins_of(frame)) > 0
+    wide[ORIGIN : ORIGIN + 3] = lattice.origin
+    at = HEADER
+    data = _put_expected(asked.expected, HEADER + SENSOR * int(row[SENSORS]), row)
 
     def put(values: npt.NDArray[np.float32]) -> int:
         """Write float32 numbers behind all others; return where they begin."""
@@ -91,10 +119,6 @@ def pack(asked: Asked, rays_of: Callable[[DepthImage, Lattice], Rays], row: I32)
         real[begin:data] = values.reshape(-1)
         return begin
 
-    for cloud in frame.clouds:
-        row[at + KIND : at + HEIGHT + 1] = CLOUD, put(cloud.points), len(cloud.points), 1
-        real[at + TRANSFORM : at + TRANSFORM + 16] = part_transform(cloud, lattice).reshape(-1)
-        at += SENSOR
     for image in frame.depths:
         height, width = image.depth.shape
         rays = rays_of(image, lattice)
@@ -102,7 +126,33 @@ def pack(asked: Asked, rays_of: Callable[[DepthImage, Lattice], Rays], row: I32)
         row[at + KIND : at + HEIGHT + 1] = DEPTH, 2 * data, width, height
         half[2 * data : 2 * data + image.depth.size] = image.depth.reshape(-1)
         data += (image.depth.size + 1) // 2
+        row[at + KNOWS] = True
+        wide[(at + PLACE) // 2 : (at + PLACE) // 2 + 12] = image.T_world_camera[:3].reshape(-1)
+        wide[(at + LENS) // 2 : (at + LENS) // 2 + 5] = lens_of(image)
         real[at + TRANSFORM : at + TRANSFORM + 16] = 0.0
         real[at + TRANSFORM + 3 : at + TRANSFORM + 12 : 4] = rays.t
         real[at + TABLE : at + TABLE + 16] = camera_table(image, lattice).reshape(-1)
         at += SENSOR
+    for cloud in frame.clouds:
+        placed = cloud.T_world_sensor
+        row[at + KIND : at + HEIGHT + 1] = CLOUD, put(cloud.points), len(cloud.points), 1
+        row[at + KNOWS] = placed is not None
+        wide[(at + PLACE) // 2 : (at + PLACE) // 2 + 12] = (np.eye(4) if placed is None else placed)[
+            :3
+        ].reshape(-1)
+        real[at + TRANSFORM : at + TRANSFORM + 16] = part_transform(cloud, lattice).reshape(-1)
+        at += SENSOR
+
+
+def _put_expected(expected: Expected | None, begin: int, row: I32) -> int:
+    """Write the expected heads to ``row``, from the first whole octet on; return where they end."""
+    first, count = -(-begin // OCTET), 0 if expected is None else len(expected)
+    row[EXPECTED], row[EXPECTED_AT] = count, first
+    if expected is not None and count:
+        octets = row[: row.size // OCTET * OCTET].view(np.float64).reshape(-1, 8)[first : first + count]
+        octets[:, :3], octets[:, 3:7], octets[:, 7] = (
+            expected.centres,
+            expected.quaternions,
+            expected.reaches_m,
+        )
+    return (first + count) * OCTET

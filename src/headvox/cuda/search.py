@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import cuda
 
+from headvox.assemble import MOST_POSES
 from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.cuda import compact, gate, integral, judge, suppress, vote, voxelize
+from headvox.cuda.fits import Fits
+from headvox.cuda.graph import capture
 from headvox.cuda.lanes import SIMULATED
-from headvox.cuda.readings import Asked, Found, pack, words_of
+from headvox.cuda.readings import OCTET, Asked, Found, pack, words_of
 from headvox.data import DepthImage
 from headvox.gate import gate_tables
 from headvox.suppress import PEAK_REACH
@@ -25,6 +29,7 @@ from headvox.visibility import cells_of
 from headvox.vote import seen_boxes
 from headvox.voxelize import Lattice, Rays
 
+I64 = npt.NDArray[np.int64]
 I32 = npt.NDArray[np.int32]
 
 # The simulator runs every thread in turn: a few of each kind are enough to show what goes wrong between them.
@@ -40,50 +45,55 @@ class Search:
     """Kernels and buffers for up to ``frames`` frames at once, of lattices of one shape, by one cascade.
 
     ``around`` (M, 3) are the voxels about a peak that compete for it, ``most_peaks`` how many peaks a frame may have,
-    and ``patch_reach`` how far about a peak the grid is wanted.
+    and ``refines`` what is fitted to them: see :class:`headvox.config.DetectorConfig`.
     """
 
     def __init__(
-        self, cascade: CompiledCascade, shape: tuple[int, int, int], around: I32, most_peaks: int, patch_reach: int,
+        self, cascade: CompiledCascade, shape: tuple[int, int, int], around: I32, most_peaks: int, refines: str,
         frames: int,
     ) -> None:  # fmt: skip
         nx, ny, nz = self.shape = shape
-        self.cascade, self.frames, self.most_peaks, self.reach = cascade, frames, most_peaks, patch_reach
+        self.cascade, self.frames, self.most_peaks, self.refines = cascade, frames, most_peaks, refines
         self.counting = cascade.source.counting
         self.stream = cuda.stream()
-        self._cell_type = np.dtype(np.uint32 if self.counting else np.uint8)
+        self.is_graph = False
+        """Whether a frame is one launch."""
+        self._again: dict[tuple[int, int], Callable[[], None]] = {}
         self._room_for_words(1)
         cells = math.prod(shape)
         self.cells = self._empty(cells if self.counting else -(-cells // 4), np.uint32)
-        self._grid = self.cells.view(self._cell_type)
+        self.grid = self.cells if self.counting else self.cells.view(np.uint8)
         self.S = cuda.device_array((frames, nx + 1, ny + 1, nz + 1), np.uint32)
         self.places = (nx + 2) * (ny + 2) * (nz + 2)
         self.passed = self._empty(-(-self.places // 32), np.uint32)
         self.shares = self._empty(SHARES, np.int32)
-        self.counts = self._empty(suppress.KEPT + 1, np.int32)
+        self.counts = self._empty(suppress.HEADS + 1, np.int32)
         self._make_room(FIRST_CANDIDATES)
         self._tables(around)
-        each = judge.REPORT_HEADER + judge.ROW * most_peaks
-        side = 2 * patch_reach + 1
-        patch_bytes = most_peaks * side**3 * self._cell_type.itemsize
-        self.report = self._empty(8 * each + -(-patch_bytes // 8) * 8, np.uint8)
-        self._report_rows, self._report_cells = self.report.view(np.int64), self.report.view(self._cell_type)
-        self.host_report = cuda.pinned_array(self.report.shape, np.uint8)
-        self._first_patch = 8 * each // self._cell_type.itemsize
+        source = cascade.source
+        self.fits = Fits(frames, most_peaks, refines, cascade.voxel_m, source.subdivision, source.counting)
+        poses = MOST_POSES if refines == "pose" else 0
+        self.report = self._empty(judge.REPORT_HEADER + judge.ROW * most_peaks + judge.POSE * poses, np.int64)
+        self.real_report = self.report.view(np.float64)
+        self.host_report = cuda.pinned_array(self.report.shape, np.int64)
 
     def _empty(self, count: int, dtype: npt.DTypeLike) -> Any:
         return cuda.device_array((self.frames, count), dtype)
 
     def _room_for_words(self, words: int) -> None:
         """Have room for rows of so many words."""
-        words = -(-words // 4) * 4
+        words = -(-words // OCTET) * OCTET
+        self._again.clear()
         self.host_rows = cuda.pinned_array((self.frames, words), np.int32)
         self.host_rows[:] = 0
         self.whole = cuda.device_array((self.frames, words), np.int32)
         self.real, self.half = self.whole.view(np.float32), self.whole.view(np.uint16)
         self.quads = self.real.reshape(self.frames, words // 4, 4)
+        self.wide = self.whole.view(np.float64)
+        self.octets = self.wide.reshape(self.frames, words // OCTET, 8)
 
     def _make_room(self, candidates: int) -> None:
+        self._again.clear()
         self.candidates = self._empty(candidates, np.int32)
         self.scores, self.yaws = self._empty(candidates, np.int64), self._empty(candidates, np.int32)
         self.yaws.copy_to_device(np.zeros((self.frames, candidates), np.int32))
@@ -110,7 +120,7 @@ class Search:
         self.peaks, self.peak_places = self._empty(most, np.int32), self._empty(most, np.int32)
         self.peak_scores, self.best = self._empty(most, np.int64), self._empty(most, np.int32)
         self.judged, self.judged_places = self._empty(most, np.int32), self._empty(most, np.int32)
-        self.judged_scores, self.kept = self._empty(most, np.int64), self._empty(most, np.int32)
+        self.judged_scores = self._empty(most, np.int64)
         self.unseen = cuda.to_device(np.zeros((self.frames, 1, 1, 2), np.int32))
         boxes = seen_boxes(cascade.judge)[0] if cascade.judge else np.zeros((0, 6), np.int32)
         offsets, start = cells_of(boxes)
@@ -124,22 +134,38 @@ class Search:
 
     def run(self, asked: Sequence[Asked], rays_of: Callable[[DepthImage, Lattice], Rays]) -> list[Found]:
         """Return what is found in each of up to ``frames`` frames."""
-        words = max(words_of(one.frame) for one in asked)
+        words = max(words_of(one) for one in asked)
         if words > self.host_rows.shape[1]:
             self._room_for_words(words + words // 4)
         for one, row in zip(asked, self.host_rows, strict=False):
             pack(one, rays_of, row)
         sensors = max(len(one.frame.clouds) + len(one.frame.depths) for one in asked)
         while True:
-            self.upload()
-            self.launch(len(asked), sensors)
-            self.download()
+            self._start(len(asked), sensors)
             self.stream.synchronize()
             found = [self._read(row) for row in self.host_report[: len(asked)]]
             most = max(one.candidates for one in found)
             if most <= self.candidates.shape[1]:
                 return found
             self._make_room(2 * most)  # and again: some did not fit
+
+    def _start(self, frames: int, sensors: int) -> None:
+        """Start everything: the first time call by call, then as one graph, which is kept while the buffers are."""
+        again = self._again.get((frames, sensors))
+        if again is not None:
+            again()
+            return
+        plainly = partial(self.all_of, frames, sensors)
+        plainly()
+        graph = capture(self.stream, plainly)
+        self.is_graph = graph is not None
+        self._again[frames, sensors] = graph or plainly
+
+    def all_of(self, frames: int, sensors: int) -> None:
+        """Start the upload, all stages and the download, one by one."""
+        self.upload()
+        self.launch(frames, sensors)
+        self.download()
 
     def upload(self) -> None:
         """Start to copy all rows to the device."""
@@ -157,6 +183,7 @@ class Search:
         self._vote(frames)
         self._suppress(frames)
         self._judge(frames)
+        self.fits.launch(self, frames)
         self._report(frames)
 
     def on(self, items: int, frames: int, sensors: int = 1) -> tuple[Any, ...]:
@@ -176,8 +203,8 @@ class Search:
     def _integrate(self, frames: int) -> None:
         nx, ny, nz = (n + 1 for n in self.shape)
         integral.sum_along_z[self.on(nx * ny, frames)](self.cells, self.counting, self.S)
-        integral.sum_along_y[self.on(nx * nz, frames)](self.S)
-        integral.sum_along_x[self.on(ny * nz, frames)](self.S)
+        integral.sum_along[self.on(nx * nz, frames)](self.S)
+        integral.sum_along[self.on(ny * nz, frames)](self.S.reshape(self.frames, 1, nx, ny * nz))
 
     def _gate(self, frames: int) -> None:
         spacing = self.cascade.gate.spacing
@@ -268,37 +295,30 @@ class Search:
         )  # fmt: skip
 
     def _report(self, frames: int) -> None:
-        judge.report[(1, frames), 1, self.stream](
-            self.S, self.whole, self.counts, self.judged, self.judged_places, self.judged_scores, self.yaws, self.kept,
-            self._report_rows,
-        )  # fmt: skip
-        judge.copy_patches[self.on(self.most_peaks * THREADS, frames)](
-            self.S, self.counts, self._grid, self.kept, self.reach,
-            self._report_cells, self._first_patch,
+        fits = self.fits
+        judge.report[self.on(self.most_peaks, frames)](
+            self.S, self.counts, self.judged, self.judged_places, self.judged_scores, self.yaws, fits.kept, fits.heads,
+            fits.spheres, fits.poses, self.refines == "pose", self.report, self.real_report,
         )  # fmt: skip
 
-    def _read(self, report: npt.NDArray[np.uint8]) -> Found:
+    def _read(self, report: I64) -> Found:
         """Return what a frame's report says, in memory of its own."""
-        head = 8 * (judge.REPORT_HEADER + judge.ROW * self.most_peaks)
-        numbers = report[:head].view(np.int64)
-        rows = numbers[judge.REPORT_HEADER :].reshape(-1, judge.ROW)[: numbers[judge.COUNT]]
-        place = rows[:, judge.PLACE]
+        count, end = int(report[judge.COUNT]), judge.REPORT_HEADER + judge.ROW * self.most_peaks
+        rows = report[judge.REPORT_HEADER : end].reshape(-1, judge.ROW)[:count]
+        place, spheres = rows[:, judge.PLACE], rows.view(np.float64)[:, judge.SPHERE :]
         cells = np.stack(
             [place // self.layer, place % self.layer // self.column, place % self.column], axis=1
         )
-        side = 2 * self.reach + 1
-        patch_of = rows[:, judge.PATCH].copy()
-        patches = (
-            report[head:].view(self._cell_type)[: self.most_peaks * side**3].reshape(-1, side, side, side)
-        )
+        poses = report[end:].view(np.float64).reshape(-1, judge.POSE)[:count]
         return Found(
-            bool(numbers[judge.TOTAL]),
-            int(numbers[judge.FOUND]),
+            bool(report[judge.TOTAL]),
+            int(report[judge.FOUND]),
             (cells - 1).astype(np.int32),
             rows[:, judge.SCORE].copy(),
-            rows[:, judge.YAW].astype(np.int32),
-            patches[: patch_of.max(initial=-1) + 1].copy(),
-            patch_of,
+            rows[:, judge.YAW].copy(),
+            spheres[:, :3].copy(),
+            spheres[:, 3].copy(),
+            judge.poses_of(poses) if self.refines == "pose" else None,
         )
 
 

@@ -8,8 +8,8 @@ from numba import cuda
 from headvox.cuda.lanes import device, kernel
 from headvox.vote import DROPPED
 
-CANDIDATES, MAXIMA, PEAKS, JUDGED, KEPT = range(5)
-"""What the columns of ``counts`` (frames, 5) tell the number of."""
+CANDIDATES, MAXIMA, PEAKS, JUDGED, KEPT, HEADS = range(6)
+"""What the columns of ``counts`` (frames, 6) tell the number of."""
 
 
 @device

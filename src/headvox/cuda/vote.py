@@ -15,6 +15,7 @@ import numpy.typing as npt
 from numba import cuda
 
 from headvox.compile_masks import CompiledStages, CompiledVotes
+from headvox.cuda.blocks import sum_of_all
 from headvox.cuda.gate import cell_of
 from headvox.cuda.lanes import LANE_WISE, device, kernel, on_device, product_64, sum_about_voxel
 from headvox.cuda.readings import SEES
@@ -56,21 +57,6 @@ def leaf_of(tree, root, depth, nodes, features):  # type: ignore[no-untyped-def]
     for _ in range(depth[tree]):
         at = nodes[at + 2] if features[nodes[at]] <= nodes[at + 1] else nodes[at + 3]
     return nodes[at + 1]
-
-
-@device
-def sum_of_all(totals, thread, threads):  # type: ignore[no-untyped-def]
-    """Return the sum of ``totals`` (threads,), shared by a block whose threads, a power of two, all call this."""
-    cuda.syncthreads()
-    step = threads // 2
-    while step > 0:
-        if thread < step:
-            totals[thread] += totals[thread + step]
-        cuda.syncthreads()
-        step //= 2
-    total = totals[0]
-    cuda.syncthreads()
-    return total
 
 
 @kernel

@@ -1,0 +1,317 @@
+"""The pose fit: all starts of all heads at once, each refined to its end; what is best of them is asked afterwards.
+
+On the CPU a start is refined only when those before it were, and are not the same. Here there are threads for all of
+them, and :mod:`headvox.settle` chooses as it does there. A block takes a start; its threads share out the points, and
+what they add up is added in an order that is always the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import cuda
+
+from headvox.align import (
+    COARSE_K,
+    COARSE_MODES,
+    COARSE_SAMPLES,
+    COARSE_STEPS,
+    EVIDENCE,
+    FINE_K,
+    FINE_RAYS,
+    FINE_SAMPLES,
+    FINE_STEPS,
+    LAST_K,
+    MOST_REFINED,
+    PARAMETERS,
+    RESIDUAL,
+    STATE,
+    TOLD,
+    WEIGHT,
+    WEIGHTED,
+    add_prior_cost,
+    add_priors,
+    add_turn,
+    invert_column,
+    move,
+    pick,
+    weigh,
+)
+from headvox.assemble import MOST_POSES
+from headvox.cuda.blocks import share_of, sum_rows
+from headvox.cuda.lanes import MATH, device, kernel, on_device, wait_for_block
+from headvox.cuda.nearby import RAYS, ROUND, SAMPLES
+from headvox.cuda.suppress import HEADS
+from headvox.settle import (
+    LEAST_SAMPLES,
+    column,
+    fit_head,
+    odds,
+    quaternion_of,
+    settle,
+    turn_between,
+)
+from headvox.template import MODES
+
+MOST_THREADS = 128  # of a block; a power of two
+COLUMNS = FINE_SAMPLES + FINE_RAYS
+SYSTEM = PARAMETERS + 1  # rows and columns of A: the last ones are the residual's
+
+_weigh = on_device(weigh, np=MATH)
+_add_prior_cost = on_device(add_prior_cost)
+_add_priors = on_device(add_priors, add_turn=on_device(add_turn))
+_invert_column = on_device(invert_column)
+_move = on_device(move, np=MATH)
+_pick = on_device(pick, np=MATH)
+
+
+class Starts(NamedTuple):
+    """What the starts of all heads came to: rows of (frames * heads, starts); the first start is what is expected."""
+
+    costs: Any
+    """(.., starts) after the coarse steps; infinite where a start was not tried"""
+    coarse: Any
+    """(.., starts, STATE)"""
+    fine: Any
+    """(.., starts, STATE)"""
+    told: Any
+    """(.., starts, TOLD)"""
+    covariances: Any
+    """(.., starts, 6, 6)"""
+
+
+class Work(NamedTuple):
+    """What :func:`headvox.settle.fit_head` knows of a head, as :class:`headvox.align.Scratch` on the CPU."""
+
+    samples: Any
+    """Whether the points lie all around, (1,): nothing else is asked of them"""
+    costs: Any
+    coarse: Any
+    all_fine: Any
+    all_told: Any
+    all_covariances: Any
+    fine: Any
+    told: Any
+    covariances: Any
+
+
+@device
+def factor(A, size, thread, threads):  # type: ignore[no-untyped-def]
+    """Leave the Cholesky factor in the lower half of A, and what solves L x = -(column RESIDUAL) in its last row.
+
+    All threads of a block call this: as :func:`headvox.align.solve`, a column at a time.
+    """
+    for j in range(size):
+        wait_for_block()
+        if thread == 0:
+            v = A[j, j]
+            for q in range(j):
+                v -= A[j, q] * A[j, q]
+            A[j, j] = MATH.sqrt(max(v, 1e-12))
+        wait_for_block()
+        for i in range(j + 1 + thread, size + 1, threads):
+            row = i if i < size else PARAMETERS
+            v = A[j, i] if i < size else -A[j, RESIDUAL]
+            for q in range(j):
+                v -= A[row, q] * A[j, q]
+            A[row, j] = v / A[j, j]
+    wait_for_block()
+
+
+@device
+def solve_back(A, size, x):  # type: ignore[no-untyped-def]
+    """Write the step to ``x``, and return half the logarithm of the determinant."""
+    half_log_det = 0.0
+    for i in range(size - 1, -1, -1):
+        v = A[PARAMETERS, i]
+        for q in range(i + 1, size):
+            v -= A[q, i] * x[q]
+        x[i] = v / A[i, i]
+        half_log_det += MATH.log(A[i, i])
+    return half_log_det
+
+
+@device
+def accumulate(J, count, size, A, thread, threads):  # type: ignore[no-untyped-def]
+    """Set the upper half of A to J W Jᵀ over ``count`` columns, and its last column to J W e: an entry a thread."""
+    entries = size * (size + 1) // 2 + size
+    for entry in range(thread, entries, threads):
+        i, left = 0, entry
+        while left >= size + 1 - i:
+            left -= size + 1 - i
+            i += 1
+        j = i + left if i + left < size else RESIDUAL
+        total = 0.0
+        for s in range(count):
+            total += J[i, s] * J[WEIGHT, s] * J[j, s]
+        A[i, j] = total
+    wait_for_block()
+
+
+@device
+def linearise(  # type: ignore[no-untyped-def]
+    points, first, n, rays, m, modes, k, upright, template, state, J, A, told, costs, thread, threads
+):
+    """As :func:`headvox.align.linearise`, by all threads of a block, of ``n`` points from the ``first`` on."""
+    a, b = share_of(n, thread, threads)
+    c, d = share_of(m, thread, threads)
+    mine = J[:, a + c : b + d]
+    cost, count = _weigh(
+        points[first + a : first + b], b - a, rays[c:d], d - c, modes, k, True, template.rows, template.low,
+        template.voxel_m, state, mine, told[thread],
+    )  # fmt: skip
+    for i in range(WEIGHTED):
+        for s in range(count, b + d - a - c):
+            mine[i, s] = 0.0
+    costs[thread, 0] = cost
+    sum_rows(costs, thread, threads)
+    sum_rows(told, thread, threads)
+    accumulate(J, n + m, 7 + modes, A, thread, threads)
+    if thread == 0:
+        _add_priors(state, modes, upright, A)
+    return 0.5 * _add_prior_cost(costs[0, 0], state, modes, upright)
+
+
+@kernel
+def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, scratch, starts):  # type: ignore[no-untyped-def]
+    """Fit each start of each head: coarsely, but for the expected one, then to the end. ``scratch`` has a J a block."""
+    told = cuda.shared.array((MOST_THREADS, TOLD), np.float64)
+    costs = cuda.shared.array((MOST_THREADS, 1), np.float64)
+    A = cuda.shared.array((SYSTEM, SYSTEM), np.float64)
+    state = cuda.shared.array(STATE, np.float64)
+    x = cuda.shared.array((6, PARAMETERS), np.float64)
+    frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
+    J = scratch[frame * cuda.gridDim.x + cuda.blockIdx.x]
+    each = starts.costs.shape[1]
+    heads = min(counts[frame, HEADS], MOST_POSES)
+    for job in range(cuda.blockIdx.x, heads * each, cuda.gridDim.x):
+        head, start = job // each, job % each
+        at_head = frame * MOST_POSES + head
+        n, m = near[frame, head, SAMPLES], near[frame, head, RAYS]
+        stands = start == 0 or not near[frame, head, ROUND]
+        there = upright.shape[0] if stands else anyhow.shape[0]
+        tries = n >= LEAST_SAMPLES and start <= there
+        if start == 0:
+            tries = tries and MATH.isfinite(turns[at_head, 0])
+        if thread == 0:
+            starts.costs[at_head, start] = 0.0 if tries else MATH.inf
+        if not tries:
+            continue
+        for k in range(thread, STATE, threads):
+            state[k] = 0.0
+            if 3 <= k < 12:
+                state[k] = turns[at_head, k - 3]
+                if start > 0:
+                    state[k] = upright[start - 1, k - 3] if stands else anyhow[start - 1, k - 3]
+        cuda.syncthreads()
+        n_coarse, n_fine, m = min(n, COARSE_SAMPLES), min(n, FINE_SAMPLES), min(m, FINE_RAYS)
+        for step in range(COARSE_STEPS + 1 if start > 0 and there > 1 else 0):
+            cost = linearise(
+                points[at_head], FINE_SAMPLES, n_coarse, passing[at_head], 0, COARSE_MODES,
+                COARSE_K - min(step, COARSE_STEPS - 1), stands, template, state, J, A, told, costs, thread, threads,
+            )  # fmt: skip
+            if step < COARSE_STEPS:
+                factor(A, 7 + COARSE_MODES, thread, threads)
+                if thread == 0:
+                    solve_back(A, 7 + COARSE_MODES, x[0])
+                    _move(state, x[0], 7 + COARSE_MODES)
+            elif thread == 0:
+                starts.costs[at_head, start] = cost
+            cuda.syncthreads()
+        for k in range(thread, STATE, threads):
+            starts.coarse[at_head, start, k] = state[k]
+        cuda.syncthreads()
+        for step in range(FINE_STEPS + 1):
+            scale = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
+            cost = linearise(
+                points[at_head], 0, n_fine, passing[at_head], m, MODES, scale, stands, template, state, J, A, told,
+                costs, thread, threads,
+            )  # fmt: skip
+            factor(A, PARAMETERS, thread, threads)
+            if thread == 0:
+                half_log_det = solve_back(A, PARAMETERS, x[0])
+                if step < FINE_STEPS:
+                    _move(state, x[0], PARAMETERS)
+                else:
+                    for k in range(TOLD):
+                        starts.told[at_head, start, k] = told[0, k]
+                    starts.told[at_head, start, EVIDENCE] = cost + half_log_det
+            cuda.syncthreads()
+        for column_of in range(thread, 6, threads):
+            _invert_column(A, x[column_of], column_of)
+            for k in range(6):
+                starts.covariances[at_head, start, k, column_of] = x[column_of, k]
+        for k in range(thread, STATE, threads):
+            starts.fine[at_head, start, k] = state[k]
+        cuda.syncthreads()
+
+
+@device
+def is_round(samples, n):  # type: ignore[no-untyped-def]
+    """Return what was found when the points were gathered: see :mod:`headvox.cuda.nearby`."""
+    return samples[ROUND] != 0
+
+
+@device
+def choose_refined(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def]
+    """As :func:`headvox.align.align`, of starts that are refined: the first, if one is asked for, or the others."""
+    count = starts.shape[0]
+    first = 0 if count == 1 else 1
+    costs, coarse, least = work.costs[first:], work.coarse[first:], MATH.inf
+    for i in range(count):
+        least = min(least, costs[i])
+    refined = 0
+    while refined < MOST_REFINED:
+        best = _pick(costs, count, least, coarse, work.fine, refined)
+        if best < 0:
+            break
+        for j in range(STATE):
+            work.fine[refined, j] = work.all_fine[first + best, j]
+        for j in range(TOLD):
+            work.told[refined, j] = work.all_told[first + best, j]
+        for i in range(6):
+            for j in range(6):
+                work.covariances[refined, i, j] = work.all_covariances[first + best, i, j]
+        refined += 1
+    return refined
+
+
+_quaternion_of = on_device(quaternion_of, np=MATH)
+_turn_between = on_device(turn_between, np=MATH, quaternion_of=_quaternion_of, column=on_device(column))
+_settle = on_device(
+    settle, np=MATH, quaternion_of=_quaternion_of, turn_between=_turn_between, odds=on_device(odds, np=MATH)
+)
+_fit_head = on_device(fit_head, np=MATH, is_round=is_round, align=choose_refined, settle=_settle)
+
+
+@kernel
+def settle_heads(counts, near, heads, spheres, turns, upright, anyhow, template, starts, chosen, poses):  # type: ignore[no-untyped-def]
+    """Choose the best state of each head, and write it to ``poses``; a thread a head.
+
+    ``chosen`` are the states that are asked for, and what is told of them, a row a head.
+    """
+    frame = cuda.blockIdx.y
+    fine, told, covariances = chosen
+    for head in range(cuda.grid(1), min(counts[frame, HEADS], MOST_POSES), cuda.gridsize(1)):
+        i = frame * MOST_POSES + head
+        work = Work(
+            near[frame, head], starts.costs[i], starts.coarse[i], starts.fine[i], starts.told[i], starts.covariances[i],
+            fine[i], told[i], covariances[i],
+        )  # fmt: skip
+        n, m = near[frame, head, SAMPLES], near[frame, head, RAYS]
+        centre = spheres[frame, heads[frame, head]]
+        clear_pose(poses, i, centre)
+        _fit_head(work, n, m, centre, turns[i], upright, anyhow, template, poses, i)
+
+
+@device
+def clear_pose(poses, i, centre):  # type: ignore[no-untyped-def]
+    """Say of head ``i`` that nothing is known but its ``centre``."""
+    poses.radii[i] = poses.misfits[i] = poses.coverages[i] = poses.crossings[i] = MATH.nan
+    for k in range(4):
+        poses.quaternions[i, k] = MATH.nan
+    for a in range(3):
+        poses.centres[i, a] = centre[a]
+        for b in range(3):
+            poses.centre_covariances[i, a, b] = poses.rotation_covariances[i, a, b] = MATH.nan

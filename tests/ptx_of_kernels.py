@@ -4,7 +4,12 @@ test_cuda.py runs this file in a process of its own: it stands in for the device
 being launched, a kernel is compiled for the arguments that it would be given.
 """
 
+import importlib.util
+import os
 import re
+import subprocess
+import tempfile
+from pathlib import Path
 from types import SimpleNamespace
 
 import numba
@@ -21,6 +26,7 @@ from headvox.suppress import AROUND
 from headvox.voxelize import Lattice
 
 KERNELS = 23
+MOST_THREADS, REGISTERS = 256, 1 << 16  # of a block
 FITS = {"fit_spheres", "gather", "fit_starts", "settle_heads"}  # within a tolerance of the CPU's
 
 
@@ -67,6 +73,24 @@ def compiled(monkeypatch):
     return ptx
 
 
+def assembles(ptx):
+    """Whether the code for the device lacks nothing, fits a block's registers and shared memory, and spills nothing."""
+    ptxas = Path(importlib.util.find_spec("nvidia").submodule_search_locations[0]) / "cuda_nvcc/bin/ptxas"
+    with tempfile.NamedTemporaryFile("w", suffix=".ptx") as file:
+        file.write(ptx)
+        file.flush()
+        done = subprocess.run(
+            [ptxas, "-arch=sm_90", "-v", "-o", os.devnull, file.name],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    told = done.stdout + done.stderr
+    assert done.returncode == 0, told
+    registers = int(re.search(r"Used (\d+) registers", told)[1])
+    return registers * MOST_THREADS <= REGISTERS and "0 bytes spill stores" in told
+
+
 def test_every_kernel_compiles_and_rounds_every_product(compiled):
     """No a * b + c became one operation that rounds once, which the CPU does not have."""
     from headvox.cuda.readings import Asked
@@ -86,4 +110,5 @@ def test_every_kernel_compiles_and_rounds_every_product(compiled):
     for (name, _), text in compiled.items():
         assert ".visible .entry" in text
         assert name in FITS or not re.search(r"\b(fma|mad)\.(rn\.)?f(32|64)", text), name
+    assert all(assembles(text) for text in compiled.values())
     assert "mul.rn.f32" in next(text for (name, _), text in compiled.items() if name == "mark")

@@ -183,7 +183,7 @@ def odds_and_errors(number: int) -> tuple[np.ndarray, ...] | None:
     start = view.head.centre + rng.uniform(0.02, 0.05) * off / np.linalg.norm(off)
     scratch, poses = Scratch.new(), Poses.unknown(start[None])
     n, m = gather(sensors_of(view.frame), start, scratch.samples, scratch.rays)
-    starts, nothing = (upright_turns(), all_turns()), np.full(9, np.nan)
+    starts, nothing = (upright_turns(), all_turns()), np.full((1, 9), np.nan)
     best, count = fit_head(scratch, n, m, start, nothing, *starts, load_template(), poses, 0)
     if count == 0:
         return None

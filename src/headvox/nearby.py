@@ -175,12 +175,11 @@ def _may_be_near(flat, at, ball, knows):  # type: ignore[no-untyped-def]
 
 
 @rule
-def look_at_point(points, i, T, knows, reach):  # type: ignore[no-untyped-def]
+def look_at_point(px, py, pz, T, knows, reach):  # type: ignore[no-untyped-def]
     """Return what a point shows, its turned coordinates, the square of its distance from the sensor, and where along.
 
     It is where its ray is nearest to the origin, times the ray's length.
     """
-    px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz
     y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz
     z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz
@@ -237,7 +236,8 @@ def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):
             bits &= bits - np.uint32(1)
             if i % step or i >= points.shape[0]:
                 continue
-            kind, x, y, z, squared, along = look_at_point(points, i, T, knows, reach)
+            px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+            kind, x, y, z, squared, along = look_at_point(px, py, pz, T, knows, reach)
             if kind == NEAR:
                 hits += 1
                 if hits % every_hit == 0:

@@ -84,7 +84,7 @@ def fit_poses(
         work = scratch[part]
         while (i := next(left)) < len(centres):
             n, m = gather(sensors, centres[i], work.samples, work.rays)
-            fit_head(work, n, m, centres[i], first[i], upright, anyhow, template, poses, i)
+            fit_head(work, n, m, centres[i], first[i : i + 1], upright, anyhow, template, poses, i)
 
     threads.run(fit, [(part,) for part in range(parts)])
     return poses

@@ -18,8 +18,8 @@ ROUND_SHARE = 0.35
 def fit_head(work, n, m, centre, expected, upright, anyhow, template, poses, i):  # type: ignore[no-untyped-def]
     """Fit a head to the ``n`` samples and ``m`` rays of ``work``, and write it to row ``i`` of ``poses``.
 
-    ``expected`` (9,) is the rotation to start from, NaN where none is known; else it starts from ``upright`` (U, 9), or
-    from ``anyhow`` (A, 9) where the points lie all around. Returns which of the refined states is the best, and how
+    ``expected`` (1, 9) is the rotation to start from, NaN where none is known; else it starts from ``upright`` (U, 9),
+    or from ``anyhow`` (A, 9) where the points lie all around. Returns which of the refined states is best, and how
     many there are: none where there are too few points.
     """
     if n < LEAST_SAMPLES:
@@ -28,9 +28,9 @@ def fit_head(work, n, m, centre, expected, upright, anyhow, template, poses, i):
     refined = 0
     knows = True
     for j in range(9):
-        knows = knows and np.isfinite(expected[j])
+        knows = knows and np.isfinite(expected[0, j])
     for alone in (True, False):  # from what is expected alone, then from everywhere
-        stands, starts = True, expected.reshape(1, 9)
+        stands, starts = True, expected
         if not alone:
             stands = not is_round(work.samples, n)
             starts = upright if stands else anyhow

@@ -34,7 +34,7 @@ GATHER_THREADS = 2 if SIMULATED else nearby.MOST_THREADS
 POSE_THREADS = 2 if SIMULATED else pose.MOST_THREADS
 SPHERE_BLOCKS = 1 if SIMULATED else 64
 GATHER_BLOCKS = 2 if SIMULATED else MOST_POSES
-POSE_BLOCKS = 2 if SIMULATED else 512  # each has working memory of its own
+POSE_BLOCKS = 2 if SIMULATED else 512  # shared by the frames; each has working memory of its own
 
 
 class Fits:
@@ -59,7 +59,8 @@ class Fits:
         self.points = _reals(rows, FINE_SAMPLES + COARSE_SAMPLES, SAMPLE)
         self.passing = _reals(rows, FINE_RAYS, RAY)
         self.turns = _reals(rows, 9)
-        self.scratch = _reals(frames * POSE_BLOCKS, PARAMETERS + 3, pose.COLUMNS)
+        self.pose_blocks = max(POSE_BLOCKS // frames, 1)
+        self.scratch = _reals(frames * self.pose_blocks, PARAMETERS + 3, pose.COLUMNS)
         self.starts = pose.Starts(
             *(_reals(rows, each, *shape) for shape in ((), (STATE,), (STATE,), (TOLD,), (6, 6)))
         )
@@ -94,7 +95,7 @@ class Fits:
             search.whole, search.wide, search.real, search.half, search.octets, counts, self.heads, self.spheres,
             self.samples, self.rays, self.near, self.points, self.passing, self.turns,
         )  # fmt: skip
-        pose.fit_starts[(POSE_BLOCKS, frames), POSE_THREADS, stream](
+        pose.fit_starts[(self.pose_blocks, frames), POSE_THREADS, stream](
             counts, self.near, self.points, self.passing, self.turns, self.upright, self.anyhow, self.template,
             self.scratch, self.starts,
         )  # fmt: skip

@@ -172,9 +172,9 @@ def gather(  # type: ignore[no-untyped-def]
                 for item in range(first, after):
                     if is_cloud:
                         begin = data + 3 * step * item
-                        kind, x, y, z, squared, along = _look_at_point(
-                            real[frame, begin : begin + 3].reshape(1, 3), 0, T, knows, REACH_M
-                        )
+                        px, py = np.float64(real[frame, begin]), np.float64(real[frame, begin + 1])
+                        pz = np.float64(real[frame, begin + 2])
+                        kind, x, y, z, squared, along = _look_at_point(px, py, pz, T, knows, REACH_M)
                         length = squared
                     else:
                         u, v = u0 + item % columns * stride, v0 + item // columns * stride

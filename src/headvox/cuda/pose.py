@@ -302,7 +302,7 @@ def settle_heads(counts, near, heads, spheres, turns, upright, anyhow, template,
         n, m = near[frame, head, SAMPLES], near[frame, head, RAYS]
         centre = spheres[frame, heads[frame, head]]
         clear_pose(poses, i, centre)
-        _fit_head(work, n, m, centre, turns[i], upright, anyhow, template, poses, i)
+        _fit_head(work, n, m, centre, turns[i : i + 1], upright, anyhow, template, poses, i)
 
 
 @device

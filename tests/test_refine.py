@@ -4,14 +4,14 @@ import pytest
 import scenes
 
 from headvox.data import Cloud
-from headvox.refine import MOST_PARTS, fit_spheres
+from headvox.refine import MOST_PARTS, ROWS, fit_spheres
 from headvox.voxelize import Lattice, voxelize_points
 
 
 def fitted(cells, peaks, voxel=0.05, subdivision=2, counting=False):
     spheres = np.empty((len(peaks), 6))
-    points = np.empty((MOST_PARTS, 3))
-    fit_spheres(cells, np.array(peaks, np.int32), voxel, subdivision, counting, points, spheres)
+    room = np.empty((ROWS, MOST_PARTS))
+    fit_spheres(cells, np.array(peaks, np.int32), voxel, subdivision, counting, room, spheres)
     return spheres
 
 

@@ -14,7 +14,7 @@ from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.data import F64
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
 from headvox.integral import box_reach, shape_with_margins
-from headvox.refine import MOST_PARTS
+from headvox.refine import MOST_PARTS, ROWS
 from headvox.simd import LANES
 from headvox.visibility import cells_of
 from headvox.vote import StageTables, seen_boxes
@@ -54,7 +54,7 @@ class Memory:
         whole = np.array([0, lattice.shape[0], 0, lattice.shape[1], 0, lattice.shape[2]])
         self.passed = np.empty(math.prod(shape_of_passed(whole)), np.uint32)
         self.survivors = np.empty((4096, 3), np.int32)
-        self.points = [np.empty((MOST_PARTS, 3)) for _ in range(threads)]
+        self.parts = [np.empty((ROWS, MOST_PARTS)) for _ in range(threads)]
         self.unseen = np.zeros((1, 1, 2), np.int32)
         self.sees = cascade.source.sees  # asks every tree: not for every frame
         self.search = Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None

@@ -398,7 +398,7 @@ class Detector:
         def fit(part: int, low: int, high: int) -> None:
             fit_spheres(
                 memory.cells[0], in_lattice[low:high], lattice.voxel_m, lattice.subdivision, counting,
-                memory.points[part], spheres[low:high],
+                memory.parts[part], spheres[low:high],
             )  # fmt: skip
 
         self._threads.run(fit, _shares(len(cells), self._threads.count))

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from headvox.kernels import kernel, rule
+from headvox.kernels import bare_kernel, kernel, rule
 
 REACH_M = 0.16
 BELOW_M = 0.09
@@ -21,7 +21,7 @@ CENTRE_SIGMA_M = 0.05
 SURFACE_SIGMA_M = 0.012
 STEPS = 10
 HAIR_M = 0.0135  # the median over 710 simulated heads, with one camera (553) and with several alike
-MOST_PARTS = 8192
+ROWS, MOST_PARTS = 8, 8192  # of the working memory
 RADIUS, RMS, COUNT = 3, 4, 5  # what a row says of a sphere, behind its centre
 
 
@@ -45,8 +45,8 @@ def part_at(a, b, c, part, voxel_m, part_m):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _gather(cells, x, y, z, voxel_m, subdivision, counting, points):  # type: ignore[no-untyped-def]
-    """Write the parts near the voxel, in metres from its centre, to ``points`` (n, 3); return how many."""
+def _gather(cells, x, y, z, voxel_m, subdivision, counting, room):  # type: ignore[no-untyped-def]
+    """Write the parts near the voxel, in metres from its centre, to ``room``; return how many."""
     reach = int(np.ceil(REACH_M / voxel_m))
     part_m = voxel_m / subdivision
     found = 0
@@ -60,10 +60,10 @@ def _gather(cells, x, y, z, voxel_m, subdivision, counting, points):  # type: ig
                 for part in range(8):
                     if bits >> part & 1:
                         px, py, pz, counts = part_at(a - x, b - y, c - z, part, voxel_m, part_m)
-                        if counts and found < points.shape[0]:
-                            points[found, 0] = px
-                            points[found, 1] = py
-                            points[found, 2] = pz
+                        if counts and found < room.shape[1]:
+                            room[0, found] = px
+                            room[1, found] = py
+                            room[2, found] = pz
                             found += 1
     return found
 
@@ -83,13 +83,19 @@ def add_priors(sphere, sums):  # type: ignore[no-untyped-def]
 
 
 @rule
-def add_part(px, py, pz, sphere, sums):  # type: ignore[no-untyped-def]
-    """Add to ``sums`` what a part says of ``sphere``."""
+def weigh_part(px, py, pz, sphere):  # type: ignore[no-untyped-def]
+    """Return how a part's residual grows with the centre of ``sphere`` (x, y, z), the residual, and its weight."""
     dx, dy, dz = px - sphere[0], py - sphere[1], pz - sphere[2]
     distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
     residual = distance - sphere[3]
     weight = 1.0 / (1.0 + residual * residual / (SURFACE_SIGMA_M * SURFACE_SIGMA_M))
-    j = (-dx / distance, -dy / distance, -dz / distance, -1.0)
+    return -dx / distance, -dy / distance, -dz / distance, residual, weight
+
+
+@rule
+def add_weighed(jx, jy, jz, residual, weight, sums):  # type: ignore[no-untyped-def]
+    """Add to ``sums`` what a part says of a sphere; for its numbers see :func:`weigh_part`."""
+    j = (jx, jy, jz, -1.0)
     at = TRIANGLE
     for row in range(4):
         for column in range(row, 4):
@@ -98,6 +104,13 @@ def add_part(px, py, pz, sphere, sums):  # type: ignore[no-untyped-def]
         sums[RIGHT + row] -= weight * j[row] * residual
     sums[SQUARES] += weight * residual * residual
     sums[WEIGHTS] += weight
+
+
+@rule
+def add_part(px, py, pz, sphere, sums):  # type: ignore[no-untyped-def]
+    """Add to ``sums`` what a part says of ``sphere``."""
+    jx, jy, jz, residual, weight = weigh_part(px, py, pz, sphere)
+    add_weighed(jx, jy, jz, residual, weight, sums)
 
 
 @rule
@@ -131,21 +144,32 @@ def solve(A, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fit_spheres(cells, peaks, voxel_m, subdivision, counting, points, spheres):  # type: ignore[no-untyped-def]
+def fit_spheres(cells, peaks, voxel_m, subdivision, counting, room, spheres):  # type: ignore[no-untyped-def]
     """Fit a sphere about each of ``peaks`` (N, 3); write x, y, z (m, from the voxel's centre), radius, rms and count.
 
-    Gauss-Newton on the residuals |p - c| - r, weighted 1 / (1 + (residual / sigma)²), with Gaussian priors.
+    Gauss-Newton on the residuals |p - c| - r, weighted 1 / (1 + (residual / sigma)²), with Gaussian priors. ``room``
+    (ROWS, parts) is working memory.
     """
     A, b, sums = np.empty((4, 4)), np.empty(4), np.empty(SUMS)
     for i in range(peaks.shape[0]):
-        count = _gather(cells, peaks[i, 0], peaks[i, 1], peaks[i, 2], voxel_m, subdivision, counting, points)
+        count = _gather(cells, peaks[i, 0], peaks[i, 1], peaks[i, 2], voxel_m, subdivision, counting, room)
         sphere = spheres[i]
         sphere[:] = 0.0
         sphere[RADIUS] = RADIUS_M
         for _ in range(STEPS):
             sums[:] = 0.0
             add_priors(sphere, sums)
-            for k in range(count):
-                add_part(points[k, 0], points[k, 1], points[k, 2], sphere, sums)
+            _weigh(room, count, sphere)
+            for k in range(np.uint64(count)):
+                add_weighed(room[3, k], room[4, k], room[5, k], room[6, k], room[7, k], sums)
             sphere[RMS] = take_step(sums, A, b, sphere)
         sphere[COUNT] = count
+
+
+@bare_kernel
+def _weigh(room, count, sphere):  # type: ignore[no-untyped-def]
+    """Write what :func:`weigh_part` returns for each of ``count`` parts to the rows of ``room`` behind their places."""
+    # By itself, so that the compiler makes vectors of it: roots and quotients are slow.
+    for k in range(np.uint64(count)):
+        jx, jy, jz, residual, weight = weigh_part(room[0, k], room[1, k], room[2, k], sphere)
+        room[3, k], room[4, k], room[5, k], room[6, k], room[7, k] = jx, jy, jz, residual, weight

@@ -22,15 +22,19 @@ from headvox.refine import (
     SUMS,
     add_part,
     add_priors,
+    add_weighed,
     part_at,
     solve,
     take_step,
+    weigh_part,
 )
 
 MOST_THREADS = 128  # of a block; a power of two
 
 _part_at = on_device(part_at, np=MATH)
-_add_part = on_device(add_part, np=MATH)
+_add_part = on_device(
+    add_part, weigh_part=on_device(weigh_part, np=MATH), add_weighed=on_device(add_weighed, np=MATH)
+)
 _add_priors = on_device(add_priors, np=MATH)
 _take_step = on_device(take_step, np=MATH, solve=on_device(solve, np=MATH))
 

@@ -47,7 +47,7 @@ from headvox.integral import integral_volume
 from headvox.nearby import gather_points, sensors_of
 from headvox.pose import Poses
 from headvox.read_masks import load_cascade, parse_cascade
-from headvox.refine import COUNT, HAIR_M, MOST_PARTS, RADIUS, fit_spheres
+from headvox.refine import COUNT, HAIR_M, MOST_PARTS, RADIUS, ROWS, fit_spheres
 from headvox.suppress import suppress as suppress_on_cpu
 from headvox.suppress import suppress_overlaps
 from headvox.threads import Threads
@@ -479,7 +479,7 @@ def test_the_same_spheres(counting):
     fits = Fits(1, len(cells), "sphere", 0.06, 1 if counting else 2, counting)
     lattice = Lattice((1.2, -0.6, 0.3), 0.06, shape, fits.subdivision, REGION)
     wanted = np.empty((len(cells), 6))
-    fit_spheres(grid, cells, 0.06, fits.subdivision, counting, np.empty((MOST_PARTS, 3)), wanted)
+    fit_spheres(grid, cells, 0.06, fits.subdivision, counting, np.empty((ROWS, MOST_PARTS)), wanted)
     assert wanted[:, COUNT].min() == 0
     assert wanted[:, COUNT].max() > 40
     for haired in (False, True):
@@ -850,7 +850,7 @@ def test_the_bench_measures_everything(cascades, capsys):
         if is_simulated():
             patch.setattr(bench, "LAUNCHES", 1)
             patch.setattr(bench, "COPY_WORDS", 64)
-            patch.setattr(bench, "BATCH_FRAMES", 2)
+            patch.setattr(bench, "BATCH_FRAMES", 1)
             patch.setattr(cuda.get_current_device().__class__, "name", "simulator", raising=False)
         result = bench.measure(replace(cpu.config, refine="sphere"), camera_frame(1).depths, 1, print)
     assert result["same_candidates_and_peaks_as_cpu"]

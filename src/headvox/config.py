@@ -50,8 +50,8 @@ class DetectorConfig:
     threads: int = 1
     """Threads a frame is split over. The output does not depend on it."""
     backend: str = "cpu"
-    """Where heads are searched for: "cpu", "cuda" (an NVIDIA GPU) or "auto" (the GPU if there is one). The output does
-    not depend on it."""
+    """Where heads are searched for: "cpu", "cuda" (an NVIDIA GPU) or "auto" (the GPU if there is one). What is
+    found does not depend on it; what is fitted, in its last digits (docs/cuda.md)."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

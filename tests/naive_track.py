@@ -31,7 +31,11 @@ def price(roster, centres, R, sure, gate, now_ns):
             cost = kalman.surprise(x, P, weight, centre, loose)
             cost -= 2 * np.log((1 - identity.BENT) * upright + identity.BENT)
             may_be = (squared <= gate or near) and far <= reach and up <= identity.UP_M
-            may_be = may_be and (roster.ids[n] > 0 or sure[m]) and (cost <= identity.UNLIKELY or near)
+            may_be = (
+                may_be
+                and (roster.ids[n] > 0 or sure[m])
+                and (cost <= identity.UNLIKELY or squared <= identity.AS_EXPECTED or near)
+            )
             costs[n, m] = cost if may_be else identity.NOT_A_PAIR
     costs[roster.lost] = identity.NOT_A_PAIR
     return costs

@@ -59,9 +59,9 @@ def test_a_head_gets_an_id_after_so_many_sightings_of_so_many_frames() -> None:
     states = []
     for k, seen in enumerate((True, False, True, False, True)):
         tracks = follow(tracker, STANDING if seen else [None], k)
-        states += [(int(tracks.ids[0]), State(tracks.states[0]).name)]
-    assert states[:4] == [(0, "TENTATIVE")] * 4
-    assert states[4] == (1, "CONFIRMED")
+        states += [[(int(track.id), State(track.state).name) for track in tracks]]
+    tentative, nothing = [(0, "TENTATIVE")], []  # what is not sure is stated only where it is seen
+    assert states == [tentative, nothing, tentative, nothing, [(1, "CONFIRMED")]]
 
 
 def test_a_flicker_gets_no_id_and_goes() -> None:
@@ -120,6 +120,22 @@ def test_a_still_head_is_smoothed_whatever_its_detector_states(stated_m) -> None
     seconds = np.std(np.reshape(centres[60:], (8, 30, 3)), axis=1)
     assert np.sqrt((seconds**2).sum(axis=1).mean()) < 0.002
     assert np.linalg.norm(np.mean(centres[60:], axis=0) - [1.0, 0.5, 1.6]) < 0.005
+
+
+def test_who_sets_off_is_followed_at_once() -> None:
+    """After four seconds at rest, by 1.2 m/s² up to a metre a second; no frame behind when it walks."""
+    time_s = np.arange(240) / 30.0
+    since_s = np.maximum(time_s - 4.0, 0.0)
+    way = np.where(since_s < 1 / 1.2, 0.6 * since_s**2, since_s - 0.5 / 1.2)
+    rng, behind = np.random.default_rng(1), np.empty((20, 240))
+    for errors in behind:
+        tracker = Tracker()
+        for k, x in enumerate(way):
+            place = np.array([x, 0.0, 1.6])
+            seen = tracker.update(heads(tuple(place + rng.normal(0.0, 0.01, 3))), Frame(k * 33_333_333))
+            errors[k] = x - seen.centres[0, 0]
+    assert behind.mean(axis=0).max() < 0.04
+    assert abs(behind[:, time_s > 5.5].mean()) < 0.2 / 30.0
 
 
 def test_coasting_goes_on_along_the_path_and_is_told() -> None:

@@ -153,7 +153,7 @@ class State(IntEnum):
     """How sure a track is of its head."""
 
     TENTATIVE = 0
-    """Seen, but not often enough to be given an id."""
+    """Seen in this frame, but not often enough to be given an id."""
     CONFIRMED = 1
     """Seen in this frame."""
     COASTING = 2

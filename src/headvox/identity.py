@@ -14,9 +14,9 @@ from headvox.kalman import combine, compare
 from headvox.kernels import kernel
 from headvox.roster import Roster
 
-UNLIKELY = (
-    -3.0
-)  # -2 ln of the density of what else a head may be [m⁻⁴]: one that is less likely a track's is not its
+# A head is a track's only if it is likelier to be than this (-2 ln of a density [m⁻⁴]), or about where it is expected
+# (squared Mahalanobis distance): what is found at the far end of where a missed head may be by now is rather another.
+UNLIKELY, AS_EXPECTED = -3.0, 2.0
 NOT_A_PAIR = 1e6
 SLACK_M = 0.03  # errors that stay for a while (hair, view) are no noise to a filter, but need room in a gate
 NEAR_M, WALK_M_S, FARTHEST_M = 0.35, 1.2, 1.2  # a head is never sought farther than this from its prediction
@@ -63,7 +63,7 @@ def price(roster, centres, R, sure, gate, now_ns, costs):  # type: ignore[no-unt
             variance = HEIGHT_M * HEIGHT_M * (1.0 + 1.0 / roster.sightings[n]) + R[m, 2, 2]
             upright = np.exp(-0.5 * off * off / variance) / np.sqrt(2.0 * np.pi * variance)
             costs[n, m] -= 2.0 * np.log((1.0 - BENT) * upright + BENT)
-            if costs[n, m] > UNLIKELY and far > SAME_HEAD_M:
+            if costs[n, m] > UNLIKELY and squared[n, m] > AS_EXPECTED and far > SAME_HEAD_M:
                 costs[n, m] = NOT_A_PAIR
 
 

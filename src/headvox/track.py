@@ -33,7 +33,7 @@ from headvox.noise import measurement_noise, widen
 from headvox.roster import Roster
 from headvox.visibility import BEHIND, NO_RETURN, OUT_OF_VIEW, SEEN_EMPTY, SURFACE, see_places
 
-STILL_S, MOVING_S = 4.0, 2.0  # mean times that a head rests and moves
+STILL_S, MOVING_S = 8.0, 2.0  # mean times that a head rests and moves
 FIRST_SPEED_M_S = np.array([0.7, 0.7, 0.3])  # standard deviations of the velocity of a head that is new
 UPRIGHT = np.array([1.0, 1.0, 0.4])  # heads move along the floor more than up and down
 FADE_S = np.array([2.0, 2.0, 0.3])  # how long a head that is not seen goes on: up and down not for long
@@ -251,9 +251,10 @@ class Tracker:
         return roster
 
     def _report(self, roster: Roster, stamp_ns: int) -> Tracks:
-        """Return the living rows of ``roster`` as tracks, those with an id first."""
+        """Return the living as tracks, those with an id first; a tentative one only in a frame where it is seen."""
         order = np.argsort(np.where(roster.ids > 0, roster.ids, np.iinfo(np.int64).max), kind="stable")
-        roster = roster.rows(order[~roster.lost[order]])
+        stated = ~roster.lost & ((roster.ids > 0) | (roster.seen_ns == self.stamp_ns))
+        roster = roster.rows(order[stated[order]])
         mean, cov = _combined(roster)
         states = np.where(roster.seen_ns == self.stamp_ns, State.CONFIRMED, State.COASTING)
         states[roster.ids == 0] = State.TENTATIVE

@@ -97,7 +97,7 @@ class TrackerConfig:
     """... or only what scores too little to be a head by itself ..."""
     hidden_s: float = 3.0
     """... or is hidden behind something for so long."""
-    remember_s: float = 15.0
+    remember_s: float = 8.0
     """A head that turns up where one was lost is the same one, up to so long after it was last seen."""
     sight_m: float = 5.0
     """How far the sensors see."""

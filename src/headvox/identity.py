@@ -26,7 +26,8 @@ HEIGHT_M = 0.03  # standard deviation of the height of a head about its mean: ga
 BENT = 0.02  # share of those who bent down, or stretched: any height within a metre is as good
 MOST_SIGHTINGS = 30  # that a mean height is taken over
 BACK_M, BACK_M_S, BACK_FARTHEST_M = 0.4, 1.0, 2.0  # a lost head is found no farther than this from its way
-BACK_SIGMAS = 3.0  # nor farther than this, of HEIGHT_M for each, from its height
+BACK_SIGMAS = 3.0  # nor farther than this from its height
+VIEW_M = 0.015  # how much a mean height depends on the side that a head is seen from
 
 
 @kernel
@@ -101,7 +102,8 @@ def come_back(roster: Roster, new: I64, lost: I64) -> tuple[I64, I64]:
     share = np.clip((away * path).sum(axis=2) / np.maximum((path**2).sum(axis=2), 1e-9), 0.0, 1.0)
     far = np.linalg.norm(away - share[:, :, None] * path, axis=2)
     reach = np.minimum(BACK_M + BACK_M_S * unseen_s, BACK_FARTHEST_M)
-    spread = HEIGHT_M * np.sqrt(2.0 + 1.0 / roster.sightings[new][:, None] + 1.0 / roster.sightings[lost])
+    sightings = 1.0 / roster.sightings[new][:, None] + 1.0 / roster.sightings[lost]
+    spread = np.sqrt(2.0 * VIEW_M**2 + HEIGHT_M**2 * sightings)
     up = np.abs(roster.heights[new][:, None] - roster.heights[lost])
     unlike = (far / reach) ** 2 + (up / (BACK_SIGMAS * spread)) ** 2
     possible = (unlike <= 1.0) & (roster.seen_ns[lost] < roster.born_ns[new][:, None])

@@ -76,7 +76,8 @@ class Roster(NamedTuple):
 
     def rows(self, which: npt.NDArray[Any]) -> Roster:
         """Return a copy of the rows with these numbers, or that are true."""
-        return Roster(*(column[which] for column in self))
+        numbers = np.flatnonzero(which) if which.dtype == np.bool_ else which
+        return Roster._make([column.take(numbers, axis=0) for column in self])  # faster than column[numbers]
 
     def and_also(self, others: Roster) -> Roster:
         """Return these rows, and after them the others."""

@@ -116,7 +116,7 @@ class Tracker:
             return Expected(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
         roster = self._predicted((self._roster.ids > 0) & ~self._roster.lost, stamp_ns)
         mean, cov = _combined(roster)
-        reaches_m = np.clip(3.0 * _widest(cov), LEAST_REACH_M, MOST_REACH_M)
+        reaches_m = np.minimum(np.maximum(3.0 * _widest(cov), LEAST_REACH_M), MOST_REACH_M)
         return Expected(mean[:, :3], np.round(roster.quaternions, EXPECTED_DIGITS), reaches_m)
 
     @property
@@ -281,7 +281,7 @@ def _seconds(since_ns: I64, until_ns: int) -> F64:
 
 def _widest(cov: F64) -> F64:
     """Return the standard deviation of each place, over all axes together [m]."""
-    widest: F64 = np.sqrt(np.trace(cov[:, :3, :3], axis1=1, axis2=2))
+    widest: F64 = np.sqrt(cov[:, 0, 0] + cov[:, 1, 1] + cov[:, 2, 2])
     return widest
 
 

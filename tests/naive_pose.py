@@ -42,7 +42,7 @@ def _enter(samples, rays, start, away, sigmas, reach):
         samples.append([*(start + away), *ray, *sigmas])
         return
     along = -start @ ray
-    if 0 < along < length and np.linalg.norm(start + along * ray) < reach:
+    if 0 < along < length and np.linalg.norm(start + along * ray) < nearby.PASSING_M:
         rays.append([*(start + along * ray), *ray])
 
 
@@ -75,6 +75,7 @@ def linearise(samples, rays, most, modes, k, upright, template, state):
     passing = rays[even(len(rays), most[1])]
     near = passing[:, :3] - state[:3]
     near = near - (near * passing[:, 3:]).sum(axis=1, keepdims=True) * passing[:, 3:] + state[:3]
+    each = min(1.0, align.INDEPENDENT / len(chosen))
     for points, kind in ((chosen[:, :3], "point"), (near, "ray")):
         value, g, q, sigma, shape, inside = residuals(state, points, modes, template)
         e, variance = scale * value, (scale * sigma) ** 2
@@ -82,16 +83,17 @@ def linearise(samples, rays, most, modes, k, upright, template, state):
         if kind == "point":
             s = chosen[inside]
             variance = variance + (s[:, 6] * (g * (s[:, 3:6] @ R)).sum(axis=1)) ** 2 + s[:, 7] ** 2
-            weight = np.ones(len(e))
-            cost += k * k * np.sum(~inside)
+            weight = np.full(len(e), each)
         else:
             weight = np.where(e < 0, align.RAY_WEIGHT, 0.0)
             told[align.CROSSED] = np.sum(e < 0)
         damp = 1 / (1 + e**2 / variance / k**2)
-        cost += np.sum(weight * e**2 / variance * damp)
+        rho = e**2 / variance * damp
+        cost += np.sum(weight * rho)
         if kind == "point":
-            cost += np.sum(align.SIGMA_WEIGHT * damp * np.log(variance / align.SIGMA_UNIT_M**2))
-            told[align.COST], told[align.ON_SURFACE] = cost / 2, np.sum(e**2 / variance < k**2)
+            outside = k * k * np.sum(~inside)
+            cost += each * outside
+            told[align.COST], told[align.ON_SURFACE] = (rho.sum() + outside) / 2, np.sum(e**2 / variance < k**2)
         w = np.where(damp < align.LEAST_DAMPING, 0.0, weight * damp**2 / variance)
         A += (J * w[:, None]).T @ J
         b += (J * w[:, None]).T @ e

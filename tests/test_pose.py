@@ -55,11 +55,11 @@ def fitted(frame, centres, expected=None, threads=1):
 
 @pytest.fixture(scope="module")
 def views():
-    """People nobody has learnt from, each with a start 4 cm off."""
+    """People nobody has learnt from, three quarters from the front, each with a start 4 cm off."""
     rng = np.random.default_rng(3)
     made = []
-    for k, (distance, bearing) in enumerate([(1.0, 0.2), (1.2, 1.5), (1.4, -0.6)]):
-        view = portrait((0x7E57, k), distance, bearing, posture="standing")
+    for k in range(7):
+        view = portrait((0x7E57, k), 1.0 + 0.2 * (k % 3), 0.2 * (k - 3), posture="standing")
         off = rng.normal(size=3)
         made.append((view, view.head.centre + 0.04 * off / np.linalg.norm(off)))
     return made
@@ -89,9 +89,9 @@ def test_gathering_misses_nothing_however_far_the_sensor(distance, knows):
     rng = np.random.default_rng(int(distance))
     T = scenes.pose(rng)
     centre = T[:3, 3] + distance * T[:3, 0]
-    cloud = np.vstack([rng.normal(0, 0.2, (500, 3)), rng.normal(0, 0.5, (500, 3))])
+    cloud = np.vstack([rng.normal(0, 0.2, (500, 3)), rng.normal(0, 0.3, (1000, 3))])
     cloud[:500] += [distance, 0, 0]
-    cloud[500:1000] += [distance + 2.0, 0, 0]
+    cloud[500:] += [distance + 2.0, 0, 0]
     if not knows:
         cloud, T = cloud @ T[:3, :3].T + T[:3, 3], None
     frame = Frame(
@@ -199,17 +199,23 @@ def test_turns_between_states_equal_scipys():
 
 
 def test_heads_are_where_it_says_within_what_it_states(views):
+    far, turned = [], []
     for view, start in views:
         poses = fitted(view.frame, start)
         error = poses.centres[0] - view.head.centre
-        assert np.linalg.norm(error) < 0.02
-        assert error @ np.linalg.solve(poses.centre_covariances[0], error) < 3 * 5.2**2
-        turn = Rotation.from_quat(poses.quaternions[0]).inv() * Rotation.from_quat(view.head.quaternion)
-        d = turn.as_rotvec()
-        assert np.degrees(np.linalg.norm(d)) < 15
-        assert d @ np.linalg.solve(poses.rotation_covariances[0], d) < 3 * 5.2**2
+        far.append(np.linalg.norm(error))
+        assert error @ np.linalg.solve(poses.centre_covariances[0], error) < 16.3  # one in a thousand is farther
         assert 0.07 < poses.radii[0] < 0.12
         assert poses.coverages[0] > 0.9
+        if np.isfinite(poses.quaternions).all():
+            turn = Rotation.from_quat(poses.quaternions[0]).inv() * Rotation.from_quat(view.head.quaternion)
+            d = turn.as_rotvec()
+            turned.append(np.degrees(np.linalg.norm(d)))
+            assert d @ np.linalg.solve(poses.rotation_covariances[0], d) < 16.3
+    assert np.median(far) < 0.012
+    assert max(far) < 0.03
+    assert len(turned) >= len(views) - 1  # one is in doubt
+    assert np.median(turned) < 8
 
 
 def test_the_back_of_a_head_knows_its_centre_and_not_its_yaw(views):
@@ -225,11 +231,14 @@ def test_the_back_of_a_head_knows_its_centre_and_not_its_yaw(views):
         assert np.sqrt(np.trace(poses.centre_covariances[0])) < 0.05
         sigmas.append(np.degrees(np.sqrt(poses.rotation_covariances[0, 2, 2])))
         assert np.isnan(poses.quaternions[0]).all() == np.isnan(sigmas[-1])
-    view, start = views[0]
-    face = fitted(view.frame, start).rotation_covariances[0, 2, 2]
-    assert np.isnan(sigmas).any()  # some do not say at all where the face is, and
-    assert np.nanmin(sigmas) > SURE_DEG  # none that it knows
-    assert np.degrees(np.sqrt(face)) < SURE_DEG  # as a face at 1 m does
+        if sigmas[-1] < SURE_DEG:
+            turn = Rotation.from_quat(poses.quaternions[0]).inv() * Rotation.from_quat(view.head.quaternion)
+            assert np.degrees(turn.magnitude()) < 30
+    faces = [
+        np.degrees(np.sqrt(fitted(view.frame, start).rotation_covariances[0, 2, 2])) for view, start in views
+    ]
+    assert np.median(np.nan_to_num(sigmas, nan=90.0)) > SURE_DEG  # the back does not say where the face is
+    assert np.median(np.nan_to_num(faces, nan=90.0)) < SURE_DEG  # the face does
 
 
 def test_a_shell_is_found_however_it_is_turned():
@@ -268,7 +277,7 @@ def test_what_is_expected_holds_within_reach_only():
 
 
 def test_the_starts_are_rotations():
-    for turns, count in ((upright_turns(), 10), (all_turns(), 60)):
+    for turns, count in ((upright_turns(), 12), (all_turns(), 60)):
         R = turns.reshape(-1, 3, 3)
         assert len(R) == count
         np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (count, 1, 1)), atol=1e-12)

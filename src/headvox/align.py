@@ -5,7 +5,8 @@ The state is a centre, a rotation, a log scale and the template's modes of shape
     sum over points of rho(e / sigma)  +  rays that cross the template  +  priors,
 
 where e is the distance of a point to the surface, rho(r) = r² / (1 + r² / k²) is Geman and McClure's, and sigma adds up
-the template's own spread and the sensor's noise along and across its ray.
+the template's own spread and the sensor's noise along and across its ray. What makes a head differ from the template is
+the same for points that are near to each other, so that many points do not say more than INDEPENDENT of them would.
 """
 
 from __future__ import annotations
@@ -31,25 +32,24 @@ COST, ON_SURFACE, CROSSED, EVIDENCE = 0, 1, 2, 3  # what is told of a fit
 TOLD = 4
 
 COARSE_STEPS, FINE_STEPS = 4, 5
-COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 120, 200, 160
-COARSE_MODES = 3
+COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 120, 300, 160
+COARSE_MODES = 0
 COARSE_K, FINE_K, LAST_K = (
-    6.0,
+    4.0,
     4.0,
     2.5,
 )  # of the first coarse step (1 less each step), the first and last fine one
-ROOM = 392  # a row of the Jacobian: all points and rays in whole vectors, and 64 bytes off the caches' 4 KB alias
+ROOM = 488  # a row of the Jacobian: all points and rays in whole vectors; an odd number of lines of the cache
 MOST_STARTS = 60
 MOST_REFINED = 6
-MARGIN = 40.0  # a start that costs more than the best one by this is not refined, but for the second best
+MARGIN = 6.0  # a start that costs more than the best one by this is not refined, but for the second best
 ALIKE = 2.88  # trace of the turn between two starts that are one: 20 degrees apart
 
-RAY_WEIGHT = 20.0
+INDEPENDENT = 120.0  # so many points at most count in full: how a head differs from the template, neighbours share
+RAY_WEIGHT = 8.0
 CENTRE_SIGMA_M = 0.05
 SCALE_SIGMA = 0.05
 PITCH_SIGMA, ROLL_SIGMA = 0.32, 0.2  # of the angles' sines: a lying head pays a little, not without end
-SIGMA_WEIGHT = 0.5  # of log sigma in the cost: points are as likely as their surface is well known
-SIGMA_UNIT_M = 0.02
 LEAST_DAMPING = 0.05  # points that count less do not move the fit at all
 LONGEST_STEP_M, LARGEST_TURN_RAD = 0.03, 0.5
 LARGEST_LOG_SCALE = 0.35
@@ -145,11 +145,11 @@ def add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
 
 
 @rule
-def weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told):  # type: ignore[no-untyped-def]
+def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told):  # type: ignore[no-untyped-def]
     """Return twice what the first ``n`` points and ``m`` rays cost in ``state``, and how many of them would move it.
 
-    These have a column in ``J`` each, if it ``steps``. ``told`` receives the points' share of the cost, how many lie on
-    the surface, and how many rays cross it.
+    ``each`` point has this weight. They have a column in ``J`` each, if it ``steps``. ``told`` receives what the points
+    cost with a weight of 1, how many lie on the surface, and how many rays cross it.
     """
     cx, cy, cz = state[0], state[1], state[2]
     r00, r01, r02 = state[3], state[4], state[5]
@@ -161,12 +161,10 @@ def weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, tol
     lx, ly, lz = low[0] / voxel_m, low[1] / voxel_m, low[2] / voxel_m
     nx, ny, nz = rows.shape[0], rows.shape[1], rows.shape[2]
     k2 = k * k
-    cost = 0.0
+    points_cost = rays_cost = 0.0
     count = on = crossed = 0
     for s in range(n + m):
         is_point = s < n
-        if s == n:
-            told[COST] = 0.5 * cost
         if is_point:
             px, py, pz = points[s, 0] - cx, points[s, 1] - cy, points[s, 2] - cz
             dx, dy, dz = points[s, 3], points[s, 4], points[s, 5]
@@ -184,7 +182,7 @@ def weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, tol
         fx, fy, fz = np.floor(x - lx), np.floor(y - ly), np.floor(z - lz)
         if not ((fx >= 0.0) & (fy >= 0.0) & (fz >= 0.0) & (fx < nx) & (fy < ny) & (fz < nz)):
             if is_point:
-                cost += k2
+                points_cost += k2
             continue
         row = rows[int(fx), int(fy), int(fz)]
         gx, gy, gz = np.float64(row[1]), np.float64(row[2]), np.float64(row[3])
@@ -194,7 +192,7 @@ def weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, tol
             value += state[13 + i] * row[5 + i]
         e = scale * value
         variance = scale * scale * row[4] * row[4]
-        weight = 1.0
+        weight = each
         if is_point:
             toward = gx * (r00 * dx + r10 * dy + r20 * dz)
             toward += gy * (r01 * dx + r11 * dy + r21 * dz)
@@ -209,10 +207,11 @@ def weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, tol
         squared, bound = e * e, k2 * variance
         share = k2 / (bound + squared)
         damp = share * variance
-        cost += weight * share * squared
         if is_point:
-            cost += SIGMA_WEIGHT * damp * np.log(variance / (SIGMA_UNIT_M * SIGMA_UNIT_M))
+            points_cost += share * squared
             on += squared < bound
+        else:
+            rays_cost += share * squared
         if damp < LEAST_DAMPING or not steps:
             continue
         J[0, count], J[1, count], J[2, count] = -gx, -gy, -gz
@@ -224,10 +223,8 @@ def weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, tol
             J[7 + i, count] = scale * row[5 + i]
         J[RESIDUAL, count], J[WEIGHT, count] = e, weight * damp * share
         count += 1
-    if m == 0:
-        told[COST] = 0.5 * cost
-    told[ON_SURFACE], told[CROSSED] = on, crossed
-    return cost, count
+    told[COST], told[ON_SURFACE], told[CROSSED] = 0.5 * points_cost, on, crossed
+    return each * points_cost + RAY_WEIGHT * rays_cost, count
 
 
 @rule
@@ -252,7 +249,8 @@ def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, 
     whether the priors on pitch and roll hold. ``J`` is scrap; for ``told`` see :func:`weigh`.
     """
     size = 7 + modes
-    cost, count = weigh(points, n, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told)
+    each = min(1.0, INDEPENDENT / max(n, 1))
+    cost, count = weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told)
     cost = add_prior_cost(cost, state, modes, upright)
     if steps:
         whole = max((count + LANES - 1) // LANES, 1) * LANES

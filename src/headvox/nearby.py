@@ -16,7 +16,8 @@ from headvox.data import F64, DepthImage, Frame
 from headvox.kernels import bare_kernel, read_only, rule
 from headvox.simd import LANES, add, below, fill, load_triples, lowest, mul, sub
 
-REACH_M = 0.25
+REACH_M = 0.25  # of points, and
+PASSING_M = 0.17  # of rays: farther away is nothing of a head that they could cross
 MOST_SAMPLES = 8192  # of one candidate, shared by all sensors
 MOST_PIXELS = 4096  # of one image that are looked at for a candidate
 MOST_VISITS = 1 << 17  # points of one cloud that are looked at for a candidate
@@ -106,7 +107,7 @@ def look_at_pixel(raw, u, v, lens, origin, reach):  # type: ignore[no-untyped-de
         return NEAR, x, y, z, length, 0.0
     along = (x * ox + y * oy + oz) / length
     distance2 = ox * ox + oy * oy + oz * oz
-    passes = distance2 - along * along < reach * reach and 0.0 < along < z * length
+    passes = distance2 - along * along < PASSING_M * PASSING_M and 0.0 < along < z * length
     return PASSES if passes else FAR, x, y, z, length, along
 
 
@@ -123,9 +124,9 @@ def keep_pixel(T, x, y, z, length, lens, samples, n):  # type: ignore[no-untyped
 def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
     """Add what one depth image shows near the origin of the frame that ``T`` (3, 4) maps the camera to.
 
-    ``lens`` holds fx, fy, cx, cy and the depth scale. Points within ``reach`` go to ``samples``, rays that pass
-    within ``reach`` and end behind it to ``rays``, after the ``n`` and ``m`` that are there; there may be ``most_n``
-    and ``most_m``. Returned is how many there are then.
+    ``lens`` holds fx, fy, cx, cy and the depth scale. Points within ``reach`` go to ``samples``, rays that pass within
+    ``PASSING_M`` and end behind it to ``rays``, after the ``n`` and ``m`` that are there; there may be ``most_n`` and
+    ``most_m``. Returned is how many there are then.
     """
     most = min(MOST_PIXELS, most_n - n)
     origin, u0, u1, v0, v1, stride = window_of(lens, T, reach, depth.shape[0], depth.shape[1], most)
@@ -190,7 +191,7 @@ def look_at_point(px, py, pz, T, knows, reach):  # type: ignore[no-untyped-def]
         return NEAR, x, y, z, squared, 0.0
     along = -(x * ox + y * oy + z * oz)
     distance2 = ox * ox + oy * oy + oz * oz
-    if knows and 0.0 < along < squared and distance2 - along * along / squared < reach * reach:
+    if knows and 0.0 < along < squared and distance2 - along * along / squared < PASSING_M * PASSING_M:
         return PASSES, x, y, z, squared, along
     return FAR, x, y, z, squared, along
 

@@ -20,7 +20,8 @@ from headvox.settle import expect_turns, fit_head
 from headvox.template import load_template
 from headvox.threads import Threads
 
-YAWS = 10
+YAWS = 12
+NOD_RAD = np.radians(10.0)  # people look down a little more often than up
 
 
 class Poses(NamedTuple):
@@ -53,10 +54,10 @@ class Poses(NamedTuple):
 
 @lru_cache(maxsize=1)
 def upright_turns() -> F64:
-    """Return the rotations (YAWS, 9) of upright heads that look every way."""
-    about_z = np.zeros((YAWS, 3))
-    about_z[:, 2] = 2.0 * np.pi * np.arange(YAWS) / YAWS
-    return np.ascontiguousarray(Rotation.from_rotvec(about_z).as_matrix().reshape(YAWS, 9))
+    """Return the rotations (YAWS, 9) of heads that look every way, a little down."""
+    yaws = 2.0 * np.pi * np.arange(YAWS) / YAWS
+    turns = Rotation.from_euler("ZY", np.column_stack([yaws, np.full(YAWS, NOD_RAD)]))
+    return np.ascontiguousarray(turns.as_matrix().reshape(YAWS, 9))
 
 
 @lru_cache(maxsize=1)

@@ -7,7 +7,7 @@ import numpy as np
 from headvox.align import COST, CROSSED, EVIDENCE, FINE_RAYS, FINE_SAMPLES, ON_SURFACE, align
 from headvox.kernels import bare_kernel, rule
 
-POOR = 0.6  # mean cost of a point from which on an expected orientation is not trusted
+POOR = 0.5  # mean cost of a point from which on an expected orientation is not trusted
 LEAST_SAMPLES = 20  # fewer points say nothing about a pose
 SURE_YAW_RAD = np.radians(45.0)  # an orientation that is less sure is not stated
 ROUND_M = 0.14  # what counts as the head when we ask whether it was seen from all sides

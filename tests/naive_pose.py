@@ -93,7 +93,10 @@ def linearise(samples, rays, most, modes, k, upright, template, state):
         if kind == "point":
             outside = k * k * np.sum(~inside)
             cost += each * outside
-            told[align.COST], told[align.ON_SURFACE] = (rho.sum() + outside) / 2, np.sum(e**2 / variance < k**2)
+            told[align.COST], told[align.ON_SURFACE] = (
+                (rho.sum() + outside) / 2,
+                np.sum(e**2 / variance < k**2),
+            )
         w = np.where(damp < align.LEAST_DAMPING, 0.0, weight * damp**2 / variance)
         A += (J * w[:, None]).T @ J
         b += (J * w[:, None]).T @ e

@@ -204,7 +204,9 @@ def test_heads_are_where_it_says_within_what_it_states(views):
         poses = fitted(view.frame, start)
         error = poses.centres[0] - view.head.centre
         far.append(np.linalg.norm(error))
-        assert error @ np.linalg.solve(poses.centre_covariances[0], error) < 16.3  # one in a thousand is farther
+        assert (
+            error @ np.linalg.solve(poses.centre_covariances[0], error) < 16.3
+        )  # one in a thousand is farther
         assert 0.07 < poses.radii[0] < 0.12
         assert poses.coverages[0] > 0.9
         if np.isfinite(poses.quaternions).all():

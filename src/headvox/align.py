@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from headvox.cholesky import factor, substitute
 from headvox.data import F64
 from headvox.kernels import bare_kernel, rule
 from headvox.nearby import MOST_SAMPLES, RAY, SAMPLE
@@ -45,7 +46,9 @@ MOST_REFINED = 6
 MARGIN = 6.0  # a start that costs more than the best one by this is not refined, but for the second best
 ALIKE = 2.88  # trace of the turn between two starts that are one: 20 degrees apart
 
-INDEPENDENT = 120.0  # so many points at most count in full: how a head differs from the template, neighbours share
+INDEPENDENT = (
+    120.0  # so many points at most count in full: how a head differs from the template, neighbours share
+)
 RAY_WEIGHT = 8.0
 CENTRE_SIGMA_M = 0.05
 SCALE_SIGMA = 0.05
@@ -142,6 +145,12 @@ def add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
     A[3, RESIDUAL] += weight * wx * e
     A[4, RESIDUAL] += weight * wy * e
     A[5, RESIDUAL] += weight * wz * e
+
+
+@rule
+def weight_of_each(n):  # type: ignore[no-untyped-def]
+    """Return how much each of ``n`` points counts."""
+    return min(1.0, INDEPENDENT / max(n, 1))
 
 
 @rule
@@ -249,7 +258,7 @@ def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, 
     whether the priors on pitch and roll hold. ``J`` is scrap; for ``told`` see :func:`weigh`.
     """
     size = 7 + modes
-    each = min(1.0, INDEPENDENT / max(n, 1))
+    each = weight_of_each(n)
     cost, count = weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told)
     cost = add_prior_cost(cost, state, modes, upright)
     if steps:
@@ -284,28 +293,10 @@ def add_priors(state, modes, upright, A):  # type: ignore[no-untyped-def]
 @bare_kernel
 def solve(A, x, size):  # type: ignore[no-untyped-def]
     """Leave the Cholesky factor in the lower half of A, and the step -A⁻¹ (column RESIDUAL) in x; return ½ log det."""
-    half_log_det = 0.0
+    half_log_det = factor(A, size)
     for i in range(size):
-        for j in range(i + 1):
-            v = A[j, i]
-            for q in range(j):
-                v -= A[i, q] * A[j, q]
-            if i == j:
-                v = np.sqrt(max(v, 1e-12))
-                half_log_det += np.log(v)
-                A[i, i] = v
-            else:
-                A[i, j] = v / A[j, j]
-    for i in range(size):
-        v = -A[i, RESIDUAL]
-        for q in range(i):
-            v -= A[i, q] * x[q]
-        x[i] = v / A[i, i]
-    for i in range(size - 1, -1, -1):
-        v = x[i]
-        for q in range(i + 1, size):
-            v -= A[q, i] * x[q]
-        x[i] = v / A[i, i]
+        x[i] = -A[i, RESIDUAL]
+    substitute(A, x, size)
     return half_log_det
 
 
@@ -313,15 +304,8 @@ def solve(A, x, size):  # type: ignore[no-untyped-def]
 def invert_column(A, x, c):  # type: ignore[no-untyped-def]
     """Leave column ``c`` of (L Lᵀ)⁻¹ in ``x``, L the lower half of A."""
     for i in range(PARAMETERS):
-        v = 1.0 if i == c else 0.0
-        for q in range(i):
-            v -= A[i, q] * x[q]
-        x[i] = v / A[i, i]
-    for i in range(PARAMETERS - 1, -1, -1):
-        v = x[i]
-        for q in range(i + 1, PARAMETERS):
-            v -= A[q, i] * x[q]
-        x[i] = v / A[i, i]
+        x[i] = 1.0 if i == c else 0.0
+    substitute(A, x, PARAMETERS)
 
 
 @rule

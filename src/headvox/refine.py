@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from headvox.cholesky import factor, substitute
 from headvox.kernels import bare_kernel, kernel, rule
 
 REACH_M = 0.16
@@ -122,25 +123,11 @@ def take_step(sums, A, b, sphere):  # type: ignore[no-untyped-def]
             A[row, column] = A[column, row] = sums[at]
             at += 1
         b[row] = sums[RIGHT + row]
-    solve(A, b)
+    factor(A, 4)
+    substitute(A, b, 4)
     for i in range(4):
         sphere[i] += b[i]
     return np.sqrt(sums[SQUARES] / max(sums[WEIGHTS], 1e-9))
-
-
-@rule
-def solve(A, b):  # type: ignore[no-untyped-def]
-    """Solve the 4x4 positive definite A x = b in place, by elimination; x is left in ``b``."""
-    for i in range(4):
-        for j in range(i + 1, 4):
-            factor = A[j, i] / A[i, i]
-            for k in range(i, 4):
-                A[j, k] -= factor * A[i, k]
-            b[j] -= factor * b[i]
-    for i in range(3, -1, -1):
-        for k in range(i + 1, 4):
-            b[i] -= A[i, k] * b[k]
-        b[i] /= A[i, i]
 
 
 @kernel

@@ -37,8 +37,10 @@ from headvox.align import (
     move,
     pick,
     weigh,
+    weight_of_each,
 )
 from headvox.assemble import MOST_POSES
+from headvox.cholesky import substitute
 from headvox.cuda.blocks import share_of, sum_rows
 from headvox.cuda.lanes import MATH, device, kernel, on_device, wait_for_block
 from headvox.cuda.nearby import RAYS, ROUND, SAMPLES
@@ -59,9 +61,10 @@ COLUMNS = FINE_SAMPLES + FINE_RAYS
 SYSTEM = PARAMETERS + 1  # rows and columns of A: the last ones are the residual's
 
 _weigh = on_device(weigh, np=MATH)
+_weight_of_each = on_device(weight_of_each)
 _add_prior_cost = on_device(add_prior_cost)
 _add_priors = on_device(add_priors, add_turn=on_device(add_turn))
-_invert_column = on_device(invert_column)
+_invert_column = on_device(invert_column, substitute=on_device(substitute))
 _move = on_device(move, np=MATH)
 _pick = on_device(pick, np=MATH)
 
@@ -158,8 +161,8 @@ def linearise(  # type: ignore[no-untyped-def]
     c, d = share_of(m, thread, threads)
     mine = J[:, a + c : b + d]
     cost, count = _weigh(
-        points[first + a : first + b], b - a, rays[c:d], d - c, modes, k, True, template.rows, template.low,
-        template.voxel_m, state, mine, told[thread],
+        points[first + a : first + b], b - a, _weight_of_each(n), rays[c:d], d - c, modes, k, True, template.rows,
+        template.low, template.voxel_m, state, mine, told[thread],
     )  # fmt: skip
     for i in range(WEIGHTED):
         for s in range(count, b + d - a - c):

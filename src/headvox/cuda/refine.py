@@ -9,6 +9,7 @@ import numpy as np
 from numba import cuda
 
 from headvox.assemble import RADIUS_M as UNFITTED_M
+from headvox.cholesky import factor, substitute
 from headvox.cuda.blocks import sum_rows
 from headvox.cuda.gate import cell_of
 from headvox.cuda.lanes import MATH, device, kernel, on_device, product_64
@@ -24,7 +25,6 @@ from headvox.refine import (
     add_priors,
     add_weighed,
     part_at,
-    solve,
     take_step,
     weigh_part,
 )
@@ -36,7 +36,9 @@ _add_part = on_device(
     add_part, weigh_part=on_device(weigh_part, np=MATH), add_weighed=on_device(add_weighed, np=MATH)
 )
 _add_priors = on_device(add_priors, np=MATH)
-_take_step = on_device(take_step, np=MATH, solve=on_device(solve, np=MATH))
+_take_step = on_device(
+    take_step, np=MATH, factor=on_device(factor, np=MATH), substitute=on_device(substitute)
+)
 
 
 @device

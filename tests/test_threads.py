@@ -155,3 +155,13 @@ def test_what_is_taken_is_taken_once():
     threads.close()
     assert (taken == 1).all()
     assert counts[0] == len(taken) + 2
+
+
+def test_the_caller_does_not_wait_for_a_thread_that_gets_no_core():
+    threads, seen = Threads(2), []
+    alarms = threads._shared.alarms[:]
+    threads._shared.alarms.clear()  # nobody wakes it
+    threads.run(lambda: seen.append(threading.current_thread()), [(), (), ()])
+    assert seen == [threading.current_thread()] * 3
+    threads._shared.alarms.extend(alarms)
+    threads.close()

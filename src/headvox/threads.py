@@ -2,7 +2,8 @@
 
 A frame is a chain of loops of a fraction of a millisecond each, and waking a thread that sleeps takes a tenth of one.
 So the threads that help look at a flag in memory, in compiled code and without the GIL, until the next loop begins;
-and the caller so waits for them. Both offer their core to whoever else wants it all the while.
+and the caller so waits for them. Both offer their core to whoever else wants it all the while. A call goes to whoever
+is free: where there is no core for a second thread, the caller makes all calls and does not wait.
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ from headvox.simd import intrinsic
 
 I64 = npt.NDArray[np.int64]
 
-LINE = 8  # flags of different threads are a cache line apart
+LINE = 8  # what different threads write is a cache line apart
+TAKEN, ENDED = 0, LINE
 LOOKS = 64  # at a flag, before the core is offered to others
 GRACE = 45  # offers of the core, some 10 us, after which the caller is in its loop and has let go of the GIL
+PATIENCE = 100_000  # offers of the core, some 30 ms
 _offer_core = types.ExternalFunction("sched_yield", types.int32())
 
 
@@ -77,26 +80,39 @@ def begin(flags, turn):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def finish(flags, thread, turn):  # type: ignore[no-untyped-def]
-    """Tell the caller that this thread has done its ``turn``, and wait for the next one."""
-    _tell(flags, LINE * thread, turn)
-    _wait(flags, 0, turn + 1)
+def wait_for_turn(flags, turn):  # type: ignore[no-untyped-def]
+    """Wait for the caller to say that it is this ``turn``, or a later one."""
+    _wait(flags, 0, turn)
     for _ in range(GRACE):
         _offer_core()
 
 
 @bare_kernel
-def join(flags, others, turn):  # type: ignore[no-untyped-def]
-    """Wait until all others have done their ``turn``, of which they are told again."""
-    _tell(flags, 0, turn)
-    for thread in range(1, others + 1):
-        _wait(flags, LINE * thread, turn)
+def next_call(counts):  # type: ignore[no-untyped-def]
+    """Return the number of a call that nobody has taken yet."""
+    return take(counts, TAKEN)
 
 
 @bare_kernel
-def _wait(flags, at, turn):  # type: ignore[no-untyped-def]
+def call_ended(counts):  # type: ignore[no-untyped-def]
+    """Say that a call has ended."""
+    take(counts, ENDED)
+
+
+@bare_kernel
+def join(counts, calls):  # type: ignore[no-untyped-def]
+    """Wait until as many ``calls`` have ended, but not for long; return whether they have."""
+    for _ in range(PATIENCE):
+        if _told(counts, ENDED) >= calls:
+            return True
+        _offer_core()
+    return False
+
+
+@bare_kernel
+def _wait(flags, at, value):  # type: ignore[no-untyped-def]
     looks = 0
-    while _told(flags, at) < turn:
+    while _told(flags, at) < value:
         looks += 1
         if looks % LOOKS == 0:
             _offer_core()
@@ -107,17 +123,22 @@ class _Task(NamedTuple):
     function: Callable[..., None] | None
     """None sends the threads to sleep."""
     calls: Sequence[tuple[Any, ...]]
+    counts: I64
+    """How many calls were taken, and how many have ended."""
+    errors: list[BaseException]
+
+
+def _task(turn: int, function: Callable[..., None] | None, calls: Sequence[tuple[Any, ...]]) -> _Task:
+    return _Task(turn, function, calls, np.zeros(2 * LINE, np.int64), [])
 
 
 class _Shared:
     """What the threads know of each other: they must not hold the :class:`Threads`, which end when nobody does."""
 
     def __init__(self, count: int) -> None:
-        self.count = count
-        self.flags: I64 = np.zeros(LINE * count, np.int64)
-        self.task = _Task(0, None, ())
-        self.errors: list[BaseException | None] = [None] * count
-        self.alarms: list[SimpleQueue[int | None]] = [SimpleQueue() for _ in range(count)]
+        self.flags: I64 = np.zeros(LINE, np.int64)
+        self.task = _task(0, None, ())
+        self.alarms: list[SimpleQueue[int | None]] = [SimpleQueue() for _ in range(1, count)]
 
 
 class Threads:
@@ -132,8 +153,8 @@ class Threads:
         self._process = os.getpid()
         self._shared = _Shared(self.count)
         self._others = [
-            Thread(target=_serve, args=(self._shared, k), name="headvox", daemon=True)
-            for k in range(1, self.count)
+            Thread(target=_serve, args=(self._shared, alarm), name="headvox", daemon=True)
+            for alarm in self._shared.alarms
         ]
         for thread in self._others:
             thread.start()
@@ -154,7 +175,7 @@ class Threads:
             yield
         finally:
             self._awake = False
-            begin(self._shared.flags, self._hand_out(None, ()))
+            begin(self._shared.flags, self._hand_out(None, ()).turn)
 
     def run(self, function: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> None:
         """Call ``function`` with each of ``calls``; returns, or raises, when all have ended."""
@@ -163,24 +184,20 @@ class Threads:
                 function(*arguments)
             return
         with self.awake():
-            shared = self._shared
-            shared.errors = [None] * self.count
-            turn = self._hand_out(function, calls)
+            task = self._hand_out(function, calls)
             try:
-                begin(shared.flags, turn)
-                for arguments in calls[:: self.count]:
-                    function(*arguments)
+                begin(self._shared.flags, task.turn)
+                _do_share(task)
             finally:
-                join(shared.flags, len(self._others), turn)  # nobody may still write when the caller goes on
-        for error in shared.errors:
-            if error is not None:
-                raise error
+                while not join(task.counts, len(calls)):  # nobody may still write when the caller goes on
+                    pass  # but Ctrl-C is heard
+        for error in task.errors:
+            raise error
 
-    def _hand_out(self, function: Callable[..., None] | None, calls: Sequence[tuple[Any, ...]]) -> int:
-        """Say what is to be run next; return its turn."""
-        turn = self._shared.task.turn + 1
-        self._shared.task = _Task(turn, function, calls)
-        return turn
+    def _hand_out(self, function: Callable[..., None] | None, calls: Sequence[tuple[Any, ...]]) -> _Task:
+        """Say what is to be run next."""
+        task = self._shared.task = _task(self._shared.task.turn + 1, function, calls)
+        return task
 
     def close(self) -> None:
         """End the threads."""
@@ -192,27 +209,37 @@ class Threads:
 
 def _ring(shared: _Shared, turn: int | None) -> None:
     """Wake the threads for what comes after ``turn``, or end them."""
-    for alarm in shared.alarms[1:]:
+    for alarm in shared.alarms:
         alarm.put(turn)
 
 
-def _serve(shared: _Shared, thread: int) -> None:
+def _serve(shared: _Shared, alarm: SimpleQueue[int | None]) -> None:
     done = 0
-    while (turn := shared.alarms[thread].get()) is not None:
+    while (turn := alarm.get()) is not None:
         asleep = turn < done  # it was still awake when it was to be woken
         while not asleep:
-            finish(shared.flags, thread, done)
-            done, asleep = _take_turn(shared, thread)
+            wait_for_turn(shared.flags, done + 1)
+            done, asleep = _take_turn(shared.task)
 
 
-def _take_turn(shared: _Shared, thread: int) -> tuple[int, bool]:
+def _take_turn(task: _Task) -> tuple[int, bool]:
     """Do this thread's share of what was handed out last; return its turn, and whether that was to sleep."""
-    turn, function, calls = shared.task
-    if function is None:
-        return turn, True
+    if task.function is not None:
+        _do_share(task)
+    return task.turn, task.function is None
+
+
+def _do_share(task: _Task) -> None:
+    """Make calls of the task until all are taken."""
+    while (k := next_call(task.counts)) < len(task.calls):
+        _make_call(task, k)
+
+
+def _make_call(task: _Task, k: int) -> None:
     try:
-        for arguments in calls[thread :: shared.count]:
-            function(*arguments)
+        if task.function is not None:
+            task.function(*task.calls[k])
     except BaseException as error:
-        shared.errors[thread] = error
-    return turn, False
+        task.errors.append(error)
+    finally:
+        call_ended(task.counts)

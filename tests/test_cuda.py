@@ -1,4 +1,4 @@
-"""The back end for GPUs, as far as a machine without one can tell; on_gpu.py has what runs on the device."""
+"""The back end for GPUs, as far as a machine without one can tell; on_gpu*.py have what runs on the device."""
 
 import importlib.util
 import json
@@ -33,10 +33,10 @@ GPU = there_is_a_gpu()
 without_gpu = pytest.mark.skipif(GPU, reason="there is a GPU")
 
 
-def run_pytest(file: str, **environment: str) -> None:
-    """Run the tests of ``file`` in a process of its own, and fail with what it printed."""
+def run_pytest(*files: str, **environment: str) -> None:
+    """Run the tests of ``files`` in a process of its own, and fail with what it printed."""
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", str(TESTS / file)],
+        [sys.executable, "-m", "pytest", *(str(TESTS / file) for file in files)],
         env={**os.environ, **environment},
         cwd=TESTS.parent,
         capture_output=True,
@@ -50,7 +50,9 @@ def run_pytest(file: str, **environment: str) -> None:
 @pytest.mark.skipif(not INSTALLED, reason="numba-cuda is not installed")
 def test_the_same_heads_on_a_gpu_or_in_the_simulator():
     """The variable has to be set before Numba is imported: so it needs a process of its own."""
-    run_pytest("on_gpu.py", **({} if GPU else {"NUMBA_ENABLE_CUDASIM": "1"}))
+    run_pytest(
+        "on_gpu.py", "on_gpu_fits.py", "on_gpu_frames.py", **({} if GPU else {"NUMBA_ENABLE_CUDASIM": "1"})
+    )
 
 
 @pytest.mark.skipif(

@@ -118,7 +118,7 @@ class Detector:
         too, and marked as not sure.
         """
         if self.on_device:
-            return self._detect_on_device([frame], [expected])[0]
+            return self._detect_together([frame], [expected])[0]
         with self._threads.awake():
             check_frame(frame)
             clock = Clock(self.stage_ms)
@@ -148,7 +148,7 @@ class Detector:
             HeadvoxError: as :meth:`detect_frame`; of several, the first.
         """
         parts = [frames[first : first + BATCH] for first in range(0, len(frames), BATCH)]
-        return [heads for part in parts for heads in self._detect_on_device(part, [None] * len(part))]
+        return [heads for part in parts for heads in self._detect_together(part, [None] * len(part))]
 
     def candidates_of_last_frame(self) -> tuple[F64, F64]:
         """Return what passed the gate of the last frame, and what the second stage gave it; for pictures and tuning.
@@ -170,8 +170,8 @@ class Detector:
         """End the detector's threads."""
         self._threads.close()
 
-    def _detect_on_device(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
-        """Return the heads in up to :data:`BATCH` frames by the GPU; where it failed, by the CPU, and from then on."""
+    def _detect_together(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
+        """Return the heads in up to :data:`BATCH` frames: at once on a GPU; without, or when it fails, one by one."""
         if self.on_device:
             self.device = self.device or OnDevice(self.config, self.cascade)
             try:

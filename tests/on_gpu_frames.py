@@ -17,9 +17,9 @@ from gpu_arrays import (
     use_few_turns,
 )
 from numba import cuda
-from test_pipeline import NARROW, SMALL, camera_frame, expecting, two_busts
+from test_pipeline import NARROW, SMALL, camera_frame, two_busts
 
-from headvox import Cloud, Detector, Frame, HeadvoxError
+from headvox import Cloud, Detector, Frame, HeadvoxError, Intrinsics
 from headvox.cli import main
 from headvox.compile_masks import compile_cascade
 from headvox.config import DetectorConfig
@@ -133,18 +133,6 @@ def test_a_batch_is_equal_and_takes_nothing_from_another_frame(cascades):
     assert all(len(heads) for heads in wanted)
 
 
-def test_an_expected_head_may_score_less(cascades):
-    frame = camera_frame(0, 1)
-    everyone = detectors(cascades, min_score=-2.0)[0].detect_frame(frame)
-    settings = {"min_score": float(everyone.scores[0]) + 0.5, "score_slack": 0.6}
-    cpu, gpu = detectors(cascades, **settings)
-    expected = expecting(everyone.centres[0])
-    heads = cpu.detect_frame(frame, expected)
-    same(gpu.detect_frame(frame, expected), heads)
-    assert len(heads) > 0
-    assert not heads.sure.any()
-
-
 def test_more_candidates_than_there_is_room_for(cascades, monkeypatch):
     monkeypatch.setattr(search, "FIRST_CANDIDATES", 32)
     cpu, gpu = detectors(cascades, max_range_m=0.3)
@@ -173,6 +161,14 @@ def test_nothing_is_allocated_once_all_is_there(cascades, monkeypatch):
     gpu.detect_frame(frame)
 
 
+def small_image():
+    """Return every other pixel of a camera's image: the simulator takes its time for each."""
+    image = camera_frame(1).depths[0]
+    c = image.intrinsics
+    half = Intrinsics(c.width // 2, c.height // 2, c.fx / 2, c.fy / 2, c.cx / 2, c.cy / 2, c.depth_scale)
+    return replace(image, depth=image.depth[::2, ::2].copy(), intrinsics=half)
+
+
 def test_the_bench_measures_everything(cascades, capsys):
     """Only that it comes to its end: in the simulator its times are made up."""
     from headvox.cuda import bench
@@ -186,7 +182,7 @@ def test_the_bench_measures_everything(cascades, capsys):
             patch.setattr(bench, "COPY_WORDS", 64)
             patch.setattr(bench, "BATCH_FRAMES", 1)
             patch.setattr(cuda.get_current_device().__class__, "name", "simulator", raising=False)
-        result = bench.measure(replace(cpu.config, refine="sphere"), camera_frame(1).depths, 1, print)
+        result = bench.measure(replace(cpu.config, refine="sphere"), (small_image(),), 1, print)
     assert result["same_candidates_and_peaks_as_cpu"]
     assert result["farthest_from_cpu_m"] <= METRES
     assert result["one_graph"] == (not is_simulated())

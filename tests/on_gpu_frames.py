@@ -58,14 +58,14 @@ def same(one, other):
     assert len(one) == len(other)
     assert one.scores.tolist() == other.scores.tolist()
     assert one.sure.tolist() == other.sure.tolist()
-    for name, tolerance in (
-        ("centres", METRES),
-        ("radii", METRES),
-        ("quaternions", RADIANS),
-        ("centre_covariances", METRES**2),
-        ("rotation_covariances", RADIANS),
+    for name, absolute, relative in (
+        ("centres", METRES, 0.0),
+        ("radii", METRES, 0.0),
+        ("quaternions", RADIANS, 0.0),
+        ("centre_covariances", METRES**2, 1e-4),
+        ("rotation_covariances", RADIANS, 1e-4),
     ):
-        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-4, atol=tolerance)
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), relative, absolute, err_msg=name)
 
 
 def frames_of_all_kinds():

@@ -56,14 +56,21 @@ def _tell(typingctx, flags, at, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def take(typingctx, counts, at):  # type: ignore[no-untyped-def]
-    """Return ``counts[at]`` and count on, in one step: no two threads get the same."""
+def _add(typingctx, counts, at, number):  # type: ignore[no-untyped-def]
+    """Return ``counts[at]`` and add to it, in one step, after everything that was written before."""
 
     def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        one = ir.Constant(ir.IntType(64), 1)
-        return builder.atomic_rmw("add", _address(context, builder, signature, arguments), one, "monotonic")
+        return builder.atomic_rmw(
+            "add", _address(context, builder, signature, arguments), arguments[2], "acq_rel"
+        )
 
-    return types.int64(counts, at), emit
+    return types.int64(counts, at, types.int64), emit
+
+
+@bare_kernel
+def take(counts, at):  # type: ignore[no-untyped-def]
+    """Return ``counts[at]`` and count on, in one step: no two threads get the same."""
+    return _add(counts, at, 1)
 
 
 def _address(context: Any, builder: Any, signature: Any, arguments: Any) -> ir.Value:
@@ -80,8 +87,10 @@ def begin(flags, turn):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def wait_for_turn(flags, turn):  # type: ignore[no-untyped-def]
-    """Wait for the caller to say that it is this ``turn``, or a later one."""
+def wait_for_turn(flags, turn, counts, made):  # type: ignore[no-untyped-def]
+    """Say that as many calls were ``made``, and wait for the caller to say that it is this ``turn``, or a later one."""
+    # One loop, so that the caller, who then goes on, finds the GIL free.
+    _add(counts, ENDED, made)
     _wait(flags, 0, turn)
     for _ in range(GRACE):
         _offer_core()
@@ -94,14 +103,8 @@ def next_call(counts):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def call_ended(counts):  # type: ignore[no-untyped-def]
-    """Say that a call has ended."""
-    take(counts, ENDED)
-
-
-@bare_kernel
 def join(counts, calls):  # type: ignore[no-untyped-def]
-    """Wait until as many ``calls`` have ended, but not for long; return whether they have."""
+    """Wait until the others have made as many ``calls``, but not for long; return whether they have."""
     for _ in range(PATIENCE):
         if _told(counts, ENDED) >= calls:
             return True
@@ -124,7 +127,7 @@ class _Task(NamedTuple):
     """None sends the threads to sleep."""
     calls: Sequence[tuple[Any, ...]]
     counts: I64
-    """How many calls were taken, and how many have ended."""
+    """How many calls were taken, and how many others than the caller have made."""
     errors: list[BaseException]
 
 
@@ -185,11 +188,14 @@ class Threads:
             return
         with self.awake():
             task = self._hand_out(function, calls)
+            made = 0
             try:
                 begin(self._shared.flags, task.turn)
-                _do_share(task)
+                made = _do_share(task)
             finally:
-                while not join(task.counts, len(calls)):  # nobody may still write when the caller goes on
+                while not join(
+                    task.counts, len(calls) - made
+                ):  # nobody may still write when the caller goes on
                     pass  # but Ctrl-C is heard
         for error in task.errors:
             raise error
@@ -214,25 +220,30 @@ def _ring(shared: _Shared, turn: int | None) -> None:
 
 
 def _serve(shared: _Shared, alarm: SimpleQueue[int | None]) -> None:
-    done = 0
+    done, counts, made = 0, np.zeros(2 * LINE, np.int64), 0
     while (turn := alarm.get()) is not None:
         asleep = turn < done  # it was still awake when it was to be woken
         while not asleep:
-            wait_for_turn(shared.flags, done + 1)
-            done, asleep = _take_turn(shared.task)
+            wait_for_turn(shared.flags, done + 1, counts, made)
+            done, counts, made, asleep = _take_turn(shared.task)
 
 
-def _take_turn(task: _Task) -> tuple[int, bool]:
-    """Do this thread's share of what was handed out last; return its turn, and whether that was to sleep."""
-    if task.function is not None:
-        _do_share(task)
-    return task.turn, task.function is None
+def _take_turn(task: _Task) -> tuple[int, I64, int, bool]:
+    """Do this thread's share of what was handed out last; return its turn, and whether that was to sleep.
+
+    In between are the counts to which the calls that it made are to be added.
+    """
+    asleep = task.function is None
+    return task.turn, task.counts, 0 if asleep else _do_share(task), asleep
 
 
-def _do_share(task: _Task) -> None:
-    """Make calls of the task until all are taken."""
+def _do_share(task: _Task) -> int:
+    """Make calls of the task until all are taken; return how many."""
+    made = 0
     while (k := next_call(task.counts)) < len(task.calls):
         _make_call(task, k)
+        made += 1
+    return made
 
 
 def _make_call(task: _Task, k: int) -> None:
@@ -241,5 +252,3 @@ def _make_call(task: _Task, k: int) -> None:
             task.function(*task.calls[k])
     except BaseException as error:
         task.errors.append(error)
-    finally:
-        call_ended(task.counts)

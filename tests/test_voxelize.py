@@ -175,10 +175,11 @@ def test_moving_the_centre_by_whole_voxels_keeps_the_cells(voxel):
         np.testing.assert_allclose(moved.centres(there), first.centres(at), atol=1e-9)
 
 
-@pytest.mark.parametrize("voxel", [0.005, 0.02])
-def test_more_voxels_than_can_be_numbered_are_refused(voxel):
+@pytest.mark.parametrize(("voxel", "radius"), [(0.005, 50.0), (0.02, 50.0), (0.01, 6.0)])
+def test_more_voxels_than_can_be_numbered_are_refused(voxel, radius):
+    """The last has cells enough, but parts whose numbers do not fit 32 bits."""
     with pytest.raises(HeadvoxError, match=r"voxels of 0\.0"):
-        Lattice.over(Region((0.0, 0.0, 0.0), 50.0, -1.0, 3.0), voxel, 2)
+        Lattice.over(Region((0.0, 0.0, 0.0), radius, -1.0, 3.0), voxel, 2)
 
 
 def test_a_million_points_in_one_cell():

@@ -31,7 +31,7 @@ TAKEN, ENDED = 0, LINE
 LOOKS = 64  # at a flag, before the core is offered to others
 GRACE = 45  # offers of the core, some 10 us, after which the caller is in its loop and has let go of the GIL
 PATIENCE = 100_000  # offers of the core, some 30 ms
-_offer_core = types.ExternalFunction("sched_yield", types.int32())
+_offer_core = types.ExternalFunction("SwitchToThread" if os.name == "nt" else "sched_yield", types.int32())
 
 
 @intrinsic

@@ -390,7 +390,7 @@ def pick(costs, count, least, coarse, fine, refined):  # type: ignore[no-untyped
         best = np.int64(0)
         for i in range(count):
             if costs[i] < costs[best]:
-                best = i  # type: ignore[assignment]
+                best = np.int64(i)
         if costs[best] == np.inf or (refined >= 2 and costs[best] > least + MARGIN):
             return np.int64(-1)
         costs[best] = np.inf

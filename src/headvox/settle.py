@@ -41,7 +41,7 @@ def fit_head(work, n, m, centre, expected, upright, anyhow, template, poses, i):
     best = np.int64(0)
     for s in range(1, refined):
         if work.told[s, EVIDENCE] < work.told[best, EVIDENCE]:
-            best = s  # type: ignore[assignment]
+            best = np.int64(s)
     if refined > 0 and np.isfinite(work.told[best, EVIDENCE]):
         poses.misfits[i] = work.told[best, COST] / used
         poses.coverages[i] = work.told[best, ON_SURFACE] / used

@@ -11,17 +11,11 @@ from PIL import Image
 
 from headvox import cli
 from headvox.describe_masks import describe_cascade
+from headvox.mask_pictures import GREEN, RED, influence_of_features, influence_of_groups, pictures_of
 from headvox.masks import Cascade
-from headvox.plot_masks import (
-    GREEN,
-    RED,
-    file_name,
-    influence_of_features,
-    influence_of_groups,
-    pictures_of,
-    plot_cascade,
-)
+from headvox.plot_masks import plot_cascade
 from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
+from headvox.table import file_name
 
 pytest.importorskip("matplotlib")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from headvox.errors import HeadvoxError
 from headvox.flags import GOOD, add_command, seed_number, whole_number
-from headvox.table import printable, table
+from headvox.table import file_name, printable, table
 from headvox.workers import add_flags, of_flags
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _masks_show(args: argparse.Namespace) -> int:
 
 
 def _masks_plot(args: argparse.Namespace) -> int:
-    from headvox.plot_masks import file_name, plot_cascade
+    from headvox.plot_masks import plot_cascade
     from headvox.read_masks import load_cascade
 
     cascade = load_cascade(args.cascade)

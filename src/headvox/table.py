@@ -1,13 +1,19 @@
-"""Plain tables for people, on any terminal."""
+"""Plain tables for people, on any terminal; names that come from files, made harmless."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 
 def printable(text: str) -> str:
     """Return ``text`` on one line and without control characters: names in files may hold any."""
     return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def file_name(text: str) -> str:
+    """Return ``text`` as a part of a file's name."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", text)[:60].strip("-") or "unnamed"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

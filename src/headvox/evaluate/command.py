@@ -27,7 +27,7 @@ from headvox.flags import (
 )
 from headvox.live import Live
 from headvox.sample import sample_folder
-from headvox.table import printable
+from headvox.table import file_name, printable
 from headvox.workers import Workers, add_flags, of_flags
 
 if TYPE_CHECKING:
@@ -237,7 +237,6 @@ def _picture(scenario: Scenario, outcomes: Sequence[Outcome], rules: Rules, fold
     """Draw what the detectors made of a scenario, and what went wrong there."""
     from headvox.evaluate.pictures import picture_mishaps
     from headvox.evaluate.plots import plot_scenario
-    from headvox.plot_masks import file_name
 
     those = [(outcome.scores[0], outcome.run) for outcome in outcomes]
     plot_scenario(those, rules, folder / f"{file_name(scenario.name)}.png")

@@ -12,32 +12,32 @@ from headvox.visibility import BEHIND, OUT_OF_VIEW
 
 def price(roster, centres, R, sure, gate, now_ns):
     """Return the cost of each pair (N, M)."""
-    costs = np.empty((roster.size, len(centres)))
-    for n in range(roster.size):
-        x, P, weight = roster.x[n], roster.P[n], roster.weights[n]
+    costs = np.empty((len(roster), len(centres)))
+    for n in range(len(roster)):
+        x, P, weight = roster["x"][n], roster["P"][n], roster["weights"][n]
         mean, cov = kalman.mixture(weight, x, P)
-        unseen_s = (now_ns - roster.seen_ns[n]) * 1e-9
+        unseen_s = (now_ns - roster["seen_ns"][n]) * 1e-9
         for m, centre in enumerate(centres):
             loose = R[m] + identity.SLACK_M**2 * np.eye(3)
             d = centre - mean[:3]
             far = np.linalg.norm(d)
             squared = d @ np.linalg.solve(cov[:3, :3] + loose, d)
-            up = min(abs(d[2]), abs(centre[2] - roster.places[n, 2]))
+            up = min(abs(d[2]), abs(centre[2] - roster["place"][n, 2]))
             near = far <= identity.SAME_HEAD_M
             reach = min(identity.NEAR_M + identity.WALK_M_S * unseen_s, identity.FARTHEST_M)
-            variance = identity.HEIGHT_M**2 * (1 + 1 / roster.sightings[n]) + R[m, 2, 2]
-            off = centre[2] - roster.heights[n]
+            variance = identity.HEIGHT_M**2 * (1 + 1 / roster["sightings"][n]) + R[m, 2, 2]
+            off = centre[2] - roster["height"][n]
             upright = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance)
             cost = kalman.surprise(x, P, weight, centre, loose)
             cost -= 2 * np.log((1 - identity.BENT) * upright + identity.BENT)
             may_be = (squared <= gate or near) and far <= reach and up <= identity.UP_M
             may_be = (
                 may_be
-                and (roster.ids[n] > 0 or sure[m])
+                and (roster["id"][n] > 0 or sure[m])
                 and (cost <= identity.UNLIKELY or squared <= identity.AS_EXPECTED or near)
             )
             costs[n, m] = cost if may_be else identity.NOT_A_PAIR
-    costs[roster.lost] = identity.NOT_A_PAIR
+    costs[roster["lost"]] = identity.NOT_A_PAIR
     return costs
 
 

@@ -39,29 +39,31 @@ def price(roster, centres, R, sure, gate, now_ns, costs):  # type: ignore[no-unt
     """
     tracks, heads = costs.shape
     mean, cov = np.empty((tracks, 6)), np.empty((tracks, 6, 6))
-    combine(roster.x, roster.P, roster.weights, mean, cov)
+    for n in range(tracks):
+        combine(roster[n], mean[n], cov[n])
     loose = R.copy()
     for m in range(heads):
         for a in range(3):
             loose[m, a, a] += SLACK_M * SLACK_M
     squared = np.empty((tracks, heads))
-    compare(roster.x, roster.P, roster.weights, mean, cov, centres, loose, squared, costs)
+    compare(roster, mean, cov, centres, loose, squared, costs)
     for n in range(tracks):
-        unseen_s = (now_ns - roster.seen_ns[n]) * 1e-9
+        row = roster[n]
+        unseen_s = (now_ns - row.seen_ns) * 1e-9
         reach = min(NEAR_M + WALK_M_S * unseen_s, FARTHEST_M)
         for m in range(heads):
             far = 0.0
             for a in range(3):
                 far += (centres[m, a] - mean[n, a]) ** 2
             far = np.sqrt(far)
-            up = min(abs(centres[m, 2] - mean[n, 2]), abs(centres[m, 2] - roster.places[n, 2]))
+            up = min(abs(centres[m, 2] - mean[n, 2]), abs(centres[m, 2] - row.place[2]))
             fits = squared[n, m] <= gate or far <= SAME_HEAD_M
-            may_be = roster.ids[n] > 0 or sure[m]
-            if roster.lost[n] or not (fits and may_be and far <= reach and up <= UP_M):
+            may_be = row.id > 0 or sure[m]
+            if row.lost or not (fits and may_be and far <= reach and up <= UP_M):
                 costs[n, m] = NOT_A_PAIR
                 continue
-            off = centres[m, 2] - roster.heights[n]
-            variance = HEIGHT_M * HEIGHT_M * (1.0 + 1.0 / roster.sightings[n]) + R[m, 2, 2]
+            off = centres[m, 2] - row.height
+            variance = HEIGHT_M * HEIGHT_M * (1.0 + 1.0 / row.sightings) + R[m, 2, 2]
             upright = np.exp(-0.5 * off * off / variance) / np.sqrt(2.0 * np.pi * variance)
             costs[n, m] -= 2.0 * np.log((1.0 - BENT) * upright + BENT)
             if costs[n, m] > UNLIKELY and squared[n, m] > AS_EXPECTED and far > SAME_HEAD_M:
@@ -72,17 +74,17 @@ def price(roster, centres, R, sure, gate, now_ns, costs):  # type: ignore[no-unt
 def note_sightings(roster, tracks, found, now_ns, centres, radii, scores, sure):  # type: ignore[no-untyped-def]
     """Enter for the ``tracks`` (K,) which of the heads were ``found`` (K,); their filters are corrected already."""
     for k in range(tracks.shape[0]):
-        n, m = tracks[k], found[k]
-        roster.seen_ns[n] = now_ns
-        roster.radii[n], roster.scores[n] = radii[m], scores[m]
-        roster.hits[n] |= sure[m]
+        row, m = roster[tracks[k]], found[k]
+        row.seen_ns = now_ns
+        row.radius, row.score = radii[m], scores[m]
+        row.hits |= sure[m]
         for a in range(3):
-            roster.places[n, a] = roster.velocities[n, a] = 0.0
+            row.place[a] = row.velocity[a] = 0.0
             for i in range(2):
-                roster.places[n, a] += roster.weights[n, i] * roster.x[n, i, a]
-                roster.velocities[n, a] += roster.weights[n, i] * roster.x[n, i, 3 + a]
-        roster.sightings[n] = min(roster.sightings[n] + 1, MOST_SIGHTINGS)
-        roster.heights[n] += (centres[m, 2] - roster.heights[n]) / roster.sightings[n]
+                row.place[a] += row.weights[i] * row.x[i, a]
+                row.velocity[a] += row.weights[i] * row.x[i, 3 + a]
+        row.sightings = min(row.sightings + 1, MOST_SIGHTINGS)
+        row.height += (centres[m, 2] - row.height) / row.sightings
 
 
 def pairs(costs: F64) -> tuple[I64, I64]:
@@ -94,18 +96,18 @@ def pairs(costs: F64) -> tuple[I64, I64]:
 
 def come_back(roster: Roster, new: I64, lost: I64) -> tuple[I64, I64]:
     """Return which rows ``new`` are heads that were known before, and the rows of those, out of ``lost``."""
-    unseen_s = (roster.seen_ns[new][:, None] - roster.seen_ns[lost]) * 1e-9
-    away = roster.places[new][:, None, :2] - roster.places[lost][:, :2]
+    unseen_s = (roster["seen_ns"][new][:, None] - roster["seen_ns"][lost]) * 1e-9
+    away = roster["place"][new][:, None, :2] - roster["place"][lost][:, :2]
     path = (
-        roster.velocities[lost][:, :2] * unseen_s[:, :, None]
+        roster["velocity"][lost][:, :2] * unseen_s[:, :, None]
     )  # if it went on, or stopped anywhere on the way
     share = np.clip((away * path).sum(axis=2) / np.maximum((path**2).sum(axis=2), 1e-9), 0.0, 1.0)
     far = np.linalg.norm(away - share[:, :, None] * path, axis=2)
     reach = np.minimum(BACK_M + BACK_M_S * unseen_s, BACK_FARTHEST_M)
-    sightings = 1.0 / roster.sightings[new][:, None] + 1.0 / roster.sightings[lost]
+    sightings = 1.0 / roster["sightings"][new][:, None] + 1.0 / roster["sightings"][lost]
     spread = np.sqrt(2.0 * VIEW_M**2 + HEIGHT_M**2 * sightings)
-    up = np.abs(roster.heights[new][:, None] - roster.heights[lost])
+    up = np.abs(roster["height"][new][:, None] - roster["height"][lost])
     unlike = (far / reach) ** 2 + (up / (BACK_SIGMAS * spread)) ** 2
-    possible = (unlike <= 1.0) & (roster.seen_ns[lost] < roster.born_ns[new][:, None])
+    possible = (unlike <= 1.0) & (roster["seen_ns"][lost] < roster["born_ns"][new][:, None])
     found, known = pairs(np.where(possible, unlike, NOT_A_PAIR))
     return new[found], lost[known]

@@ -8,8 +8,9 @@ smoothed hard, and one that sets off is followed at once.
 Orientation: an error-state (multiplicative) Kalman filter. The state is a quaternion q, world from head, and the turn
 rate in head axes [rad/s]; the covariance is that of the small turn d in R_true = R exp(d), and of the rate.
 
-Arrays have a row a track. ``x`` (N, 2, 6) position and velocity by the models; ``P`` (N, 2, 6, 6); ``weights`` (N, 2)
-of still and moving; ``q`` (N, 4) x y z w; ``rate`` (N, 3); ``C`` (N, 6, 6) covariance of turn and rate.
+In a row of a roster (``roster.py``), ``x`` (2, 6) are position and velocity by the models, ``P`` (2, 6, 6) their
+covariances, ``weights`` (2,) those of still and moving; ``q`` (4,) x y z w; ``rate`` (3,); ``C`` (6, 6) the covariance
+of turn and rate.
 """
 
 from __future__ import annotations
@@ -194,63 +195,70 @@ def _new_axes(C, q, half):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def predict_places(x, P, weights, seen, dt, still_s, moving_s, wander, density, fade_s):  # type: ignore[no-untyped-def]
+def predict_places(roster, before_ns, dt, still_s, moving_s, wander, density, fade_s):  # type: ignore[no-untyped-def]
     """Mix the models and predict each by ``dt`` seconds, in place.
 
     ``still_s`` and ``moving_s`` are the mean times between a change of model [s], ``wander`` the variance that a still
     position gains a second [m²/s], ``density`` (3,) that of the white acceleration along each axis [m²/s³]. Of one that
-    was not ``seen`` (N,) last time, the speed fades within ``fade_s`` (3,), and what is still stays where it was seen:
-    it may set off, but what moves does not come to rest in it.
+    was not seen last time, at ``before_ns``, the speed fades within ``fade_s`` (3,), and what is still stays where it
+    was seen: it may set off, but what moves does not come to rest in it.
     """
     rises, stops = 1.0 - np.exp(-dt / still_s), 1.0 - np.exp(-dt / moving_s)
-    for n in range(x.shape[0]):
-        halts = stops if seen[n] else 0.0
-        rested, moved = weights[n, STILL], weights[n, MOVING]
-        weights[n, STILL] = rested * (1.0 - rises) + moved * halts
-        weights[n, MOVING] = rested * rises + moved * (1.0 - halts)
-        still = rested * (1.0 - rises) / weights[n, STILL]  # share of those that rest now that rested before
-        moving = moved * (1.0 - halts) / weights[n, MOVING]
-        _exchange(x[n], P[n], still, moving)
+    for n in range(roster.shape[0]):
+        x, P, weights, seen = roster[n].x, roster[n].P, roster[n].weights, roster[n].seen_ns == before_ns
+        halts = stops if seen else 0.0
+        rested, moved = weights[STILL], weights[MOVING]
+        weights[STILL] = rested * (1.0 - rises) + moved * halts
+        weights[MOVING] = rested * rises + moved * (1.0 - halts)
+        still = rested * (1.0 - rises) / weights[STILL]  # share of those that rest now that rested before
+        moving = moved * (1.0 - halts) / weights[MOVING]
+        _exchange(x, P, still, moving)
         for a in range(3):
-            x[n, STILL, 3 + a] = 0.0
+            x[STILL, 3 + a] = 0.0
             for b in range(6):
-                P[n, STILL, 3 + a, b] = P[n, STILL, b, 3 + a] = 0.0
-            P[n, STILL, 3 + a, 3 + a] = STILL_SPEED_M_S * STILL_SPEED_M_S
-            P[n, STILL, a, a] += wander * dt
-        if seen[n]:
+                P[STILL, 3 + a, b] = P[STILL, b, 3 + a] = 0.0
+            P[STILL, 3 + a, 3 + a] = STILL_SPEED_M_S * STILL_SPEED_M_S
+            P[STILL, a, a] += wander * dt
+        if seen:
             for a in range(3):
-                x[n, MOVING, a] += dt * x[n, MOVING, 3 + a]
-            _drift(P[n, MOVING], dt, density)
+                x[MOVING, a] += dt * x[MOVING, 3 + a]
+            _drift(P[MOVING], dt, density)
         else:
-            _slow_down(x[n, MOVING], P[n, MOVING], dt, fade_s)
-            _stir(P[n, MOVING], dt, density)
+            _slow_down(x[MOVING], P[MOVING], dt, fade_s)
+            _stir(P[MOVING], dt, density)
 
 
 @kernel
-def predict_turns(q, rate, C, dt, density):  # type: ignore[no-untyped-def]
+def predict_turns(roster, dt, density):  # type: ignore[no-untyped-def]
     """Predict orientations by ``dt`` seconds, in place; ``density`` (3,) [rad²/s³] is of white turn acceleration."""
     step, half, angle = np.empty(4), np.empty((3, 6)), np.empty(3)
-    for n in range(q.shape[0]):
-        if np.isnan(q[n, 3]):
+    for n in range(roster.shape[0]):
+        q, rate, C = roster[n].q, roster[n].rate, roster[n].C
+        if np.isnan(q[3]):
             continue
         for a in range(3):
-            angle[a] = dt * rate[n, a]
+            angle[a] = dt * rate[a]
         _turn(angle, step)
-        _compose(q[n], step, q[n])
-        _new_axes(C[n], step, half)
-        _drift(C[n], dt, density)
+        _compose(q, step, q)
+        _new_axes(C, step, half)
+        _drift(C, dt, density)
 
 
 @kernel
-def combine(x, P, weights, mean, cov):  # type: ignore[no-untyped-def]
-    """Write the mean (N, 6) and the covariance (N, 6, 6) of both models together."""
-    for n in range(x.shape[0]):
-        still, moving = weights[n, STILL], weights[n, MOVING]
-        for a in range(6):
-            mean[n, a] = still * x[n, 0, a] + moving * x[n, 1, a]
-            for b in range(6):
-                apart = (x[n, 0, a] - x[n, 1, a]) * (x[n, 0, b] - x[n, 1, b])
-                cov[n, a, b] = still * P[n, 0, a, b] + moving * P[n, 1, a, b] + still * moving * apart
+def combine(row, mean, cov):  # type: ignore[no-untyped-def]
+    """Write the mean (6,) and the covariance (6, 6) of both models of a track together."""
+    x, P, still, moving = row.x, row.P, row.weights[STILL], row.weights[MOVING]
+    for a in range(6):
+        mean[a] = still * x[0, a] + moving * x[1, a]
+        for b in range(6):
+            apart = (x[0, a] - x[1, a]) * (x[0, b] - x[1, b])
+            cov[a, b] = still * P[0, a, b] + moving * P[1, a, b] + still * moving * apart
+
+
+@kernel
+def widest(cov):  # type: ignore[no-untyped-def]
+    """Return the standard deviation of a place of covariance ``cov`` (6, 6), over all axes together [m]."""
+    return np.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
 
 
 @rule
@@ -273,7 +281,7 @@ def _surprise(x, P, weights, centre, R, S, S_inverse, d):  # type: ignore[no-unt
 
 
 @kernel
-def compare(x, P, weights, mean, cov, centres, R, squared, surprise):  # type: ignore[no-untyped-def]
+def compare(roster, mean, cov, centres, R, squared, surprise):  # type: ignore[no-untyped-def]
     """Write how well each of M measured ``centres`` fits to each of N tracks, both (N, M).
 
     ``squared`` is the squared Mahalanobis distance from ``mean`` and ``cov`` (of :func:`combine`), ``surprise`` -2 ln
@@ -289,34 +297,37 @@ def compare(x, P, weights, mean, cov, centres, R, squared, surprise):  # type: i
                     S[a, b] = cov[n, a, b] + R[m, a, b]
             _invert(S, S_inverse)
             squared[n, m] = _squared(S_inverse, d)
-            surprise[n, m] = _surprise(x[n], P[n], weights[n], centres[m], R[m], S, S_inverse, d)
+            surprise[n, m] = _surprise(
+                roster[n].x, roster[n].P, roster[n].weights, centres[m], R[m], S, S_inverse, d
+            )
 
 
 @kernel
-def correct_places(x, P, weights, tracks, heads, centres, R):  # type: ignore[no-untyped-def]
+def correct_places(roster, tracks, heads, centres, R):  # type: ignore[no-untyped-def]
     """Update the tracks with index ``tracks`` (K,) by the measured centres with index ``heads`` (K,), in place."""
     S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     gain, step, fit = np.empty((6, 3)), np.empty(6), np.empty(2)
     for k in range(tracks.shape[0]):
-        n, m = tracks[k], heads[k]
+        m = heads[k]
+        x, P, weights = roster[tracks[k]].x, roster[tracks[k]].P, roster[tracks[k]].weights
         for i in range(2):
             for a in range(3):
-                d[a] = centres[m, a] - x[n, i, a]
+                d[a] = centres[m, a] - x[i, a]
                 for b in range(3):
-                    S[a, b] = P[n, i, a, b] + R[m, a, b]
+                    S[a, b] = P[i, a, b] + R[m, a, b]
             det = _invert(S, S_inverse)
             fit[i] = -0.5 * (_squared(S_inverse, d) + np.log(det))
-            _correct(P[n, i], S, S_inverse, d, gain, step)
+            _correct(P[i], S, S_inverse, d, gain, step)
             for a in range(6):
-                x[n, i, a] += step[a]
+                x[i, a] += step[a]
         best = max(fit[0], fit[1])
-        still, moving = weights[n, STILL] * np.exp(fit[0] - best), weights[n, MOVING] * np.exp(fit[1] - best)
-        weights[n, STILL] = min(max(still / (still + moving), LEAST_WEIGHT), 1.0 - LEAST_WEIGHT)
-        weights[n, MOVING] = 1.0 - weights[n, STILL]
+        still, moving = weights[STILL] * np.exp(fit[0] - best), weights[MOVING] * np.exp(fit[1] - best)
+        weights[STILL] = min(max(still / (still + moving), LEAST_WEIGHT), 1.0 - LEAST_WEIGHT)
+        weights[MOVING] = 1.0 - weights[STILL]
 
 
 @kernel
-def correct_turns(q, rate, C, rejected, tracks, heads, measured, R, gate):  # type: ignore[no-untyped-def]
+def correct_turns(roster, tracks, heads, measured, R, gate):  # type: ignore[no-untyped-def]
     """Update orientations by the ``measured`` quaternions, in place; rows of NaN are passed over.
 
     One that lies farther than ``gate`` (squared Mahalanobis distance) is taken for a flip and left out. After
@@ -325,34 +336,34 @@ def correct_turns(q, rate, C, rejected, tracks, heads, measured, R, gate):  # ty
     S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     gain, step, small = np.empty((6, 3)), np.empty(6), np.empty(4)
     for k in range(tracks.shape[0]):
-        n, m = tracks[k], heads[k]
+        row, m = roster[tracks[k]], heads[k]
         if np.isnan(measured[m, 3]):
             continue
-        start = np.isnan(q[n, 3])
+        q, rate, C, start = row.q, row.rate, row.C, np.isnan(row.q[3])
         if not start:
-            _between(q[n], measured[m], d)
+            _between(q, measured[m], d)
             for a in range(3):
                 for b in range(3):
-                    S[a, b] = C[n, a, b] + R[m, a, b]
+                    S[a, b] = C[a, b] + R[m, a, b]
             _invert(S, S_inverse)
             if _squared(S_inverse, d) > gate:
-                rejected[n] += 1
-                start = rejected[n] >= REJECTED_BEFORE_RESET
+                row.rejected += 1
+                start = row.rejected >= REJECTED_BEFORE_RESET
                 if not start:
                     continue
-        rejected[n] = 0
+        row.rejected = 0
         if start:
             for a in range(3):
-                q[n, a] = measured[m, a]
-                rate[n, a] = 0.0
+                q[a] = measured[m, a]
+                rate[a] = 0.0
                 for b in range(3):
-                    C[n, a, b] = R[m, a, b]
-                    C[n, a, 3 + b] = C[n, 3 + b, a] = C[n, 3 + a, 3 + b] = 0.0
-                C[n, 3 + a, 3 + a] = FIRST_RATE_RAD_S * FIRST_RATE_RAD_S
-            q[n, 3] = measured[m, 3]
+                    C[a, b] = R[m, a, b]
+                    C[a, 3 + b] = C[3 + b, a] = C[3 + a, 3 + b] = 0.0
+                C[3 + a, 3 + a] = FIRST_RATE_RAD_S * FIRST_RATE_RAD_S
+            q[3] = measured[m, 3]
             continue
-        _correct(C[n], S, S_inverse, d, gain, step)
+        _correct(C, S, S_inverse, d, gain, step)
         _turn(step, small)
-        _compose(q[n], small, q[n])
+        _compose(q, small, q)
         for a in range(3):
-            rate[n, a] += step[3 + a]
+            rate[a] += step[3 + a]

@@ -4,10 +4,44 @@ from __future__ import annotations
 
 import numpy as np
 
+from headvox.kalman import combine, widest
 from headvox.kernels import kernel
 from headvox.visibility import BEHIND, OUT_OF_VIEW
 
+KNOWN_M = 0.1  # a place is seen to be empty only where it is known as well as this
 MOST_DRAIN = 0.5  # of its life a track loses in one frame, however long: one miss never ends it
+
+
+@kernel
+def turn_page(roster, stamp_ns, longest_ns, frames, kept):  # type: ignore[no-untyped-def]
+    """Begin a frame: no hit in it yet, of so many ``frames`` that are remembered.
+
+    Write which rows are not forgotten, seen ``longest_ns`` ago at most; return whether all are ``kept`` (N,).
+    """
+    for n in range(roster.shape[0]):
+        row = roster[n]
+        row.hits = row.hits << 1 & (1 << frames) - 1
+        kept[n] = stamp_ns - row.seen_ns <= longest_ns
+    return kept.all()
+
+
+@kernel
+def missing(roster, now_ns, rows, places, known):  # type: ignore[no-untyped-def]
+    """Write which ``rows`` (N,) are alive and were not seen, their ``places`` (N, 3), and whether these are ``known``.
+
+    Return how many there are. ``known`` is (N,).
+    """
+    mean, cov = np.empty(6), np.empty((6, 6))
+    count = 0
+    for n in range(roster.shape[0]):
+        if roster[n].lost or roster[n].seen_ns == now_ns:
+            continue
+        combine(roster[n], mean, cov)
+        for a in range(3):
+            places[count, a] = mean[a]
+        rows[count], known[count] = n, widest(cov) <= KNOWN_M
+        count += 1
+    return count
 
 
 @kernel
@@ -19,31 +53,36 @@ def age(roster, now_ns, dt, states, lasts_s, missed_s, weak_s):  # type: ignore[
     ``missed_s`` for the whole of it. One that only weak heads are found for lasts ``weak_s``.
     """
     for n in range(states.shape[0]):
-        if roster.lost[n]:
+        row = roster[n]
+        if row.lost:
             continue
         life_s, trust_s = np.inf, np.inf
-        if roster.seen_ns[n] != now_ns:
+        if row.seen_ns != now_ns:
             life_s = lasts_s[states[n]]
             if states[n] != OUT_OF_VIEW and states[n] != BEHIND:
                 trust_s = missed_s
-        elif roster.hits[n] & 1 == 0:
+        elif row.hits & 1 == 0:
             life_s = trust_s = weak_s
         else:
-            roster.life[n] = 1.0
-            roster.trust[n] = min(roster.trust[n] + dt / missed_s, 1.0)
-        roster.life[n] -= min(dt / life_s, MOST_DRAIN)
-        roster.trust[n] -= min(dt / trust_s, MOST_DRAIN)
-        roster.lost[n] = min(roster.life[n], roster.trust[n]) <= 0.0
+            row.life = 1.0
+            row.trust = min(row.trust + dt / missed_s, 1.0)
+        row.life -= min(dt / life_s, MOST_DRAIN)
+        row.trust -= min(dt / trust_s, MOST_DRAIN)
+        row.lost = min(row.life, row.trust) <= 0.0
 
 
 @kernel
 def judge_new(roster, least, ready, kept):  # type: ignore[no-untyped-def]
-    """Write which tracks without an id (N,) were seen ``least`` times and get one, and which are not given up."""
+    """Write which tracks without an id (N,) were seen ``least`` times and get one, and which are not given up.
+
+    Return whether any is ``ready`` and whether all are ``kept``.
+    """
     for n in range(ready.shape[0]):
-        hits, times = roster.hits[n], 0
+        hits, times = roster[n].hits, 0
         while hits > 0:
             times += hits & 1
             hits >>= 1
-        new = roster.ids[n] == 0
-        kept[n] = not new or (times > 0 and not roster.lost[n])
+        new = roster[n].id == 0
+        kept[n] = not new or (times > 0 and not roster[n].lost)
         ready[n] = new and kept[n] and times >= least
+    return ready.any(), kept.all()

@@ -18,10 +18,9 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from headvox.align import Scratch
 from headvox.data import Cloud, Expected, Frame
 from headvox.errors import HeadvoxError
-from headvox.pose import fit_poses
+from headvox.pose import FitMemory, fit_poses
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
@@ -80,16 +79,16 @@ def measure(frame: Frame, centre: np.ndarray, R: Rotation, rng: np.random.Genera
     """Fit from 3 to 5 cm off, then from the orientation that a track would expect."""
     off = rng.normal(size=3)
     start = (centre + rng.uniform(0.03, 0.05) * off / np.linalg.norm(off))[None]
-    scratch, threads = [Scratch.new()], Threads(1)
-    fit_poses(frame, start, scratch, threads)
+    memory, threads = FitMemory.new(1, 1), Threads(1)
+    fit_poses(frame, start, memory, threads)
     began = time.thread_time()
-    poses = fit_poses(frame, start, scratch, threads)
+    poses = fit_poses(frame, start, memory, threads)
     took = time.thread_time() - began
     turned = R * Rotation.from_rotvec(np.radians(rng.normal(0.0, 7.0, 3)))
     expected = Expected(start, turned.as_quat()[None], np.array([0.1]))
-    fit_poses(frame, start, scratch, threads, expected)
+    fit_poses(frame, start, memory, threads, expected)
     began = time.thread_time()
-    tracked = fit_poses(frame, start, scratch, threads, expected)
+    tracked = fit_poses(frame, start, memory, threads, expected)
     result: dict[str, object] = {
         "centre": 1e3 * np.linalg.norm(poses.centres[0] - centre),
         "shift": 1e3 * R.inv().apply(poses.centres[0] - centre),

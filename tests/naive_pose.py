@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from headvox import align, nearby
+from headvox import align, nearby, trials
 from headvox import settle as settling
 from headvox.data import Frame
 
@@ -137,17 +137,17 @@ def align_one(samples, rays, turn, upright, template):
     modes = align.MODES
     state = np.zeros(align.STATE)
     state[3:12] = turn
-    most = (align.FINE_SAMPLES, align.FINE_RAYS)
-    for k in np.linspace(align.FINE_K, align.LAST_K, align.FINE_STEPS):
+    most = (trials.FINE_SAMPLES, trials.FINE_RAYS)
+    for k in np.linspace(trials.FINE_K, trials.LAST_K, trials.FINE_STEPS):
         _, A, b, _ = linearise(samples, rays, most, modes, k, upright, template, state)
         state = move(state, -np.linalg.solve(A, b))
-    cost, A, _, told = linearise(samples, rays, most, modes, align.LAST_K, upright, template, state)
+    cost, A, _, told = linearise(samples, rays, most, modes, trials.LAST_K, upright, template, state)
     return state, [*told, cost + 0.5 * np.linalg.slogdet(A)[1]], np.linalg.inv(A)[:6, :6]
 
 
 def settle(work, count, best, centre, template):
     """What is stated of a mixture of states: centre, radius, its covariance, quaternion and its covariance."""
-    states, evidence = work.fine[:count], work.told[:count, align.EVIDENCE]
+    states, evidence = work.states[:count], work.told[:count, align.EVIDENCE]
     R = states[best, 3:12].reshape(3, 3)
     odds = np.nan_to_num(np.exp((evidence[best] - evidence) / template.temperature))
     odds /= odds.sum()

@@ -20,7 +20,7 @@ from gpu_arrays import (
 from numba import cuda
 from test_pipeline import camera_frame
 
-from headvox import Cloud, Frame, align, assemble, settle
+from headvox import Cloud, Frame, align, assemble, trials
 from headvox import nearby as nearby_on_cpu
 from headvox import pose as pose_on_cpu
 from headvox.cuda import fits as fits_module
@@ -194,10 +194,10 @@ def test_the_same_is_gathered(kind, few):
     np.testing.assert_allclose(fits.samples.copy_to_host()[0, :n], samples[:n], atol=1e-12)
     np.testing.assert_allclose(fits.rays.copy_to_host()[0, :m], rays[:m], atol=1e-12)
     assert (n > 20 or few) if kind != "nothing near" else n == 0
-    points, used = np.zeros((align.FINE_SAMPLES, 8)), min(n, align.FINE_SAMPLES)
-    assert choose_on_cpu(samples, n, points, align.FINE_SAMPLES) == used
+    points, used = np.zeros((trials.FINE_SAMPLES, 8)), min(n, trials.FINE_SAMPLES)
+    assert choose_on_cpu(samples, n, points, trials.FINE_SAMPLES) == used
     np.testing.assert_allclose(fits.points.copy_to_host()[0, :used], points[:used], atol=1e-12)
-    assert near[nearby.ROUND] == settle.is_round(samples, n)
+    assert near[nearby.ROUND] == trials.is_round(samples, n)
 
 
 class Nothing:
@@ -209,7 +209,7 @@ class Nothing:
 
 @numba.njit
 def choose_on_cpu(source, there, target, most):
-    return align.choose(source, there, target, most)
+    return trials.choose(source, there, target, most)
 
 
 @cuda.jit
@@ -263,7 +263,7 @@ def test_the_same_poses(case, monkeypatch):
     use_few_turns(monkeypatch)
     frame, centres, expected = cases_to_fit()[case]
     centres = np.array(centres)
-    wanted = pose_on_cpu.fit_poses(frame, centres, [align.Scratch.new()], Threads(1), expected)
+    wanted = pose_on_cpu.fit_poses(frame, centres, pose_on_cpu.FitMemory.new(1, 2), Threads(1), expected)
     got, _ = fitted_on_device(frame, centres, expected)
     assert np.isfinite(wanted.radii).tolist() == [case != "too few points"] * len(centres)
     for name, one, other in zip(Poses._fields, got, wanted, strict=True):

@@ -4,15 +4,15 @@ import pytest
 import scenes
 from scipy.spatial.transform import Rotation
 
-from headvox import Cloud, DepthImage, Frame, Intrinsics, align, nearby, settle
-from headvox.align import Scratch
+from headvox import Cloud, DepthImage, Frame, Intrinsics, align, nearby, settle, trials
 from headvox.data import Expected
-from headvox.pose import Poses, all_turns, expected_turns, fit_poses, upright_turns
+from headvox.pose import FitMemory, Poses, all_turns, expected_turns, fit_poses, upright_turns
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
 from headvox.template import load_template
 from headvox.threads import Threads
+from headvox.trials import Scratch
 
 TEMPLATE = load_template()
 SURE_DEG = 15.0  # a yaw that is stated to this counts as known, see bench/refine.py
@@ -47,8 +47,8 @@ def gathered(frame, centre):
 def fitted(frame, centres, expected=None, threads=1):
     pool = Threads(threads)
     try:
-        scratch = [Scratch.new() for _ in range(threads)]
-        return fit_poses(frame, np.asarray(centres, dtype=np.float64).reshape(-1, 3), scratch, pool, expected)
+        starts = np.asarray(centres, dtype=np.float64).reshape(-1, 3)
+        return fit_poses(frame, starts, FitMemory.new(threads, len(starts)), pool, expected)
     finally:
         pool.close()
 
@@ -58,8 +58,8 @@ def views():
     """People nobody has learnt from, three quarters from the front, each with a start 4 cm off."""
     rng = np.random.default_rng(3)
     made = []
-    for k in range(7):
-        view = portrait((0x7E57, k), 1.0 + 0.2 * (k % 3), 0.2 * (k - 3), posture="standing")
+    for k in range(11):
+        view = portrait((0x7E57, k), 1.0 + 0.2 * (k % 3), 0.2 * (k % 7 - 3), posture="standing")
         off = rng.normal(size=3)
         made.append((view, view.head.centre + 0.04 * off / np.linalg.norm(off)))
     return made
@@ -112,7 +112,7 @@ def random_state(rng):
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("modes", [align.COARSE_MODES, align.MODES])
+@pytest.mark.parametrize("modes", [trials.COARSE_MODES, align.MODES])
 def test_normal_equations_equal_the_naive_twin(seed, modes):
     rng = np.random.default_rng(seed)
     samples, rays = gathered(Frame(0, depths=(bumpy_image(rng),)), np.zeros(3))
@@ -142,22 +142,23 @@ def test_one_start_equals_the_naive_twin(views):
         turn = Rotation.from_quat(view.head.quaternion).as_matrix().reshape(1, 9)
         scratch = Scratch.new()
         scratch.samples[: len(samples)], scratch.rays[: len(rays)] = samples, rays
-        count = align.align(scratch, len(samples), len(rays), turn, True, TEMPLATE)
+        tried = trials.Trials.new(1)
+        trials.search(scratch, len(samples), len(rays), turn[0], turn, turn, TEMPLATE, tried, 0)
         state, told, covariance = naive_pose.align_one(samples, rays, turn[0], True, TEMPLATE)
-        assert count == 1
-        np.testing.assert_allclose(scratch.fine[0], state, atol=1e-6)
-        np.testing.assert_allclose(scratch.told[0], told, rtol=1e-6)
-        np.testing.assert_allclose(scratch.covariances[0], covariance, rtol=1e-4, atol=1e-12)
+        assert tried.counts[0, trials.TRIED] == tried.counts[0, trials.REFINED] == 1
+        np.testing.assert_allclose(tried.states[0, 0], state, atol=1e-6)
+        np.testing.assert_allclose(tried.told[0, 0], told, rtol=1e-6)
+        np.testing.assert_allclose(tried.covariances[0, 0], covariance, rtol=1e-4, atol=1e-12)
 
 
 def scattered(rng, count):
     """What a fit may come to: states about one another, what they cost, and covariances."""
-    work = Scratch.new()
+    work = settle.Refined(np.zeros((6, align.STATE)), np.zeros((6, align.TOLD)), np.zeros((6, 6, 6)))
     for s in range(count):
-        work.fine[s] = random_state(rng)
+        work.states[s] = random_state(rng)
         if s and rng.random() < 0.5:  # half a turn away: where rotation vectors jump
             half = Rotation.from_rotvec(np.pi * np.eye(3)[rng.integers(3)]).as_matrix()
-            work.fine[s, 3:12] = (work.fine[0, 3:12].reshape(3, 3) @ half).reshape(9)
+            work.states[s, 3:12] = (work.states[0, 3:12].reshape(3, 3) @ half).reshape(9)
         root = rng.normal(0, 0.02, (6, 6))
         work.covariances[s] = root @ root.T
     work.told[:, align.EVIDENCE] = rng.normal(0, 10, len(work.told))
@@ -167,7 +168,7 @@ def scattered(rng, count):
 @pytest.mark.parametrize("seed", range(20))
 def test_settling_equals_the_naive_twin(seed):
     rng = np.random.default_rng(seed)
-    count = 1 + seed % align.MOST_REFINED
+    count = 1 + seed % trials.MOST_REFINED
     work, centre, poses = scattered(rng, count), rng.normal(size=3), Poses.unknown(np.zeros((2, 3)))
     best = int(np.argmin(work.told[:count, align.EVIDENCE]))
     if seed % 4 == 3:
@@ -199,7 +200,7 @@ def test_turns_between_states_equal_scipys():
 
 
 def test_heads_are_where_it_says_within_what_it_states(views):
-    far, turned = [], []
+    far, turned, covered = [], [], []
     for view, start in views:
         poses = fitted(view.frame, start)
         error = poses.centres[0] - view.head.centre
@@ -208,7 +209,7 @@ def test_heads_are_where_it_says_within_what_it_states(views):
             error @ np.linalg.solve(poses.centre_covariances[0], error) < 16.3
         )  # one in a thousand is farther
         assert 0.07 < poses.radii[0] < 0.12
-        assert poses.coverages[0] > 0.9
+        covered.append(poses.coverages[0])
         if np.isfinite(poses.quaternions).all():
             turn = Rotation.from_quat(poses.quaternions[0]).inv() * Rotation.from_quat(view.head.quaternion)
             d = turn.as_rotvec()
@@ -216,7 +217,9 @@ def test_heads_are_where_it_says_within_what_it_states(views):
             assert d @ np.linalg.solve(poses.rotation_covariances[0], d) < 16.3
     assert np.median(far) < 0.012
     assert max(far) < 0.03
-    assert len(turned) >= len(views) - 1  # one is in doubt
+    assert np.median(covered) > 0.9
+    assert min(covered) > 0.8  # a hand, or hair that falls over the shoulders
+    assert len(turned) >= len(views) - 2  # of one in six it is in doubt
     assert np.median(turned) < 8
 
 

@@ -96,8 +96,8 @@ def test_another_process_compiles_the_pose_fit_where_nothing_is_kept(monkeypatch
 
 
 def test_the_other_process_compiles_the_fit_for_all_that_a_detector_hands_it() -> None:
-    code = "import headvox.warmup as w; w._fit(); print(sorted(map(str, w.fit_head.signatures)))"
+    code = "import headvox.warmup as w; w._fit(); print(sorted(map(str, w.search.signatures)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     warm_up(DetectorConfig())
-    assert done.stdout.strip() == str(sorted(map(str, warmup.fit_head.signatures)))
-    assert warmup.fit_head.signatures
+    assert done.stdout.strip() == str(sorted(map(str, warmup.search.signatures)))
+    assert warmup.search.signatures

@@ -26,18 +26,17 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from headvox.align import EVIDENCE, Scratch
+from headvox.align import EVIDENCE
 from headvox.data import Intrinsics
 from headvox.frames import inverse, transform
 from headvox.kernels import kernel
-from headvox.nearby import gather, sensors_of
-from headvox.pose import Poses, all_turns, upright_turns
-from headvox.settle import fit_head
+from headvox.pose import FitMemory, fit_poses
 from headvox.synth.people import PosedBody, pose_person, sample_person, sample_pose
 from headvox.synth.people import _rest as rest
 from headvox.synth.portraits import portrait
 from headvox.synth.rays import Mesh, look
-from headvox.template import load_template
+from headvox.threads import Threads
+from headvox.trials import TRIED
 from headvox.workers import Workers
 
 TRAINING = 0x7E3A1
@@ -181,20 +180,21 @@ def odds_and_errors(number: int) -> tuple[np.ndarray, ...] | None:
     view = portrait((TRAINING, 2, number), float(distance), float(bearing), int(cameras))
     off = rng.normal(size=3)
     start = view.head.centre + rng.uniform(0.02, 0.05) * off / np.linalg.norm(off)
-    scratch, poses = Scratch.new(), Poses.unknown(start[None])
-    n, m = gather(sensors_of(view.frame), start, scratch.samples, scratch.rays)
-    starts, nothing = (upright_turns(), all_turns()), np.full((1, 9), np.nan)
-    best, count = fit_head(scratch, n, m, start, nothing, *starts, load_template(), poses, 0)
+    memory = FitMemory.new(1, 1)
+    poses, trials = fit_poses(view.frame, start[None], memory, Threads(1)), memory.trials
+    count = trials.counts[0, TRIED]
     if count == 0:
         return None
-    R = scratch.fine[:count, 3:12].reshape(-1, 3, 3)
+    evidence = trials.told[0, :count, EVIDENCE]
+    best = int(np.argmin(evidence))
+    R = trials.states[0, :count, 3:12].reshape(-1, 3, 3)
     turns = Rotation.from_matrix(R[best].T @ R).as_rotvec()
     true = Rotation.from_quat(view.head.quaternion).as_matrix()
     error = Rotation.from_matrix(R[best].T @ true).as_rotvec()[2]
     shift = R[best].T @ (poses.centres[0] - view.head.centre)
-    covariance = scratch.covariances[best]
-    evidence = scratch.told[:count, EVIDENCE] - scratch.told[best, EVIDENCE]
-    return evidence, turns[:, 2], covariance[5, 5], error, shift @ np.linalg.solve(covariance[:3, :3], shift)
+    covariance = trials.covariances[0, best]
+    squared = shift @ np.linalg.solve(covariance[:3, :3], shift)
+    return evidence - evidence[best], turns[:, 2], covariance[5, 5], error, squared
 
 
 def calibration(fits: list[tuple[np.ndarray, ...]]) -> np.ndarray:

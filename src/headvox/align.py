@@ -11,14 +11,10 @@ the same for points that are near to each other, so that many points do not say 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from headvox.cholesky import factor, substitute
-from headvox.data import F64
 from headvox.kernels import bare_kernel, rule
-from headvox.nearby import MOST_SAMPLES, RAY, SAMPLE
 from headvox.simd import LANES, add, load, mul, store, total
 from headvox.template import MODES
 
@@ -32,20 +28,7 @@ STATE = 13 + MODES  # centre (3), rotation (9) row by row, log scale, modes
 COST, ON_SURFACE, CROSSED, EVIDENCE = 0, 1, 2, 3  # what is told of a fit
 TOLD = 4
 
-COARSE_STEPS, FINE_STEPS = 4, 5
-COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 120, 300, 160
-COARSE_MODES = 0
-COARSE_K, FINE_K, LAST_K = (
-    4.0,
-    4.0,
-    2.5,
-)  # of the first coarse step (1 less each step), the first and last fine one
 ROOM = 488  # a row of the Jacobian: all points and rays in whole vectors; an odd number of lines of the cache
-MOST_STARTS = 60
-MOST_REFINED = 6
-MARGIN = 6.0  # a start that costs more than the best one by this is not refined, but for the second best
-ALIKE = 2.88  # trace of the turn between two starts that are one: 20 degrees apart
-
 INDEPENDENT = (
     120.0  # so many points at most count in full: how a head differs from the template, neighbours share
 )
@@ -56,62 +39,6 @@ PITCH_SIGMA, ROLL_SIGMA = 0.32, 0.2  # of the angles' sines: a lying head pays a
 LEAST_DAMPING = 0.05  # points that count less do not move the fit at all
 LONGEST_STEP_M, LARGEST_TURN_RAD = 0.03, 0.5
 LARGEST_LOG_SCALE = 0.35
-
-
-class Scratch(NamedTuple):
-    """The working memory of one thread: what a fit reads, what it needs, and what it comes to."""
-
-    samples: F64
-    """(MOST_SAMPLES, SAMPLE) what was gathered about the candidate (:mod:`headvox.nearby`), and"""
-    rays: F64
-    """(MOST_SAMPLES, RAY)"""
-    points: F64
-    """(FINE_SAMPLES, SAMPLE) those of the samples that are used, and"""
-    passing: F64
-    """(FINE_RAYS, RAY) of the rays"""
-    J: F64
-    """(PARAMETERS + 3, ROOM) the Jacobian, a column a point; residuals, weights and scrap"""
-    A: F64
-    """(PARAMETERS, PARAMETERS + 1) the normal equations"""
-    x: F64
-    """(PARAMETERS,) a step"""
-    costs: F64
-    """(MOST_STARTS,) of the starts"""
-    coarse: F64
-    """(MOST_STARTS, STATE) what the starts came to"""
-    fine: F64
-    """(MOST_REFINED, STATE) the refined states"""
-    told: F64
-    """(MOST_REFINED + 1, TOLD) of the refined states; the last row is scrap"""
-    covariances: F64
-    """(MOST_REFINED, 6, 6) of shift and turn, in the head's axes"""
-
-    @classmethod
-    def new(cls) -> Scratch:
-        """Return the memory for one thread, all zeros."""
-        return cls(
-            np.zeros((MOST_SAMPLES, SAMPLE)), np.zeros((MOST_SAMPLES, RAY)), np.zeros((FINE_SAMPLES, SAMPLE)),
-            np.zeros((FINE_RAYS, RAY)), np.zeros((PARAMETERS + 3, ROOM)), np.zeros((PARAMETERS, PARAMETERS + 1)),
-            np.zeros(PARAMETERS), np.zeros(MOST_STARTS), np.zeros((MOST_STARTS, STATE)),
-            np.zeros((MOST_REFINED, STATE)), np.zeros((MOST_REFINED + 1, TOLD)), np.zeros((MOST_REFINED, 6, 6)),
-        )  # fmt: skip
-
-
-@rule
-def evenly(s, used, there):  # type: ignore[no-untyped-def]
-    """Return which row of all that are ``there`` is the ``s``-th of those that are ``used``."""
-    return (2 * s + 1) * there // (2 * used)
-
-
-@rule
-def choose(source, there, target, most):  # type: ignore[no-untyped-def]
-    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many."""
-    used = min(there, most)
-    for s in range(used):
-        at = evenly(s, used, there)
-        for j in range(source.shape[1]):
-            target[s, j] = source[at, j]
-    return used
 
 
 @rule
@@ -309,7 +236,7 @@ def invert_column(A, x, c):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _invert(A, x, covariance):  # type: ignore[no-untyped-def]
+def invert(A, x, covariance):  # type: ignore[no-untyped-def]
     """Write the first 6x6 of the inverse to ``covariance``: of shift and turn, all else unknown."""
     for c in range(6):
         invert_column(A, x, c)
@@ -338,98 +265,3 @@ def move(state, x, size):  # type: ignore[no-untyped-def]
     for i in range(6, size):
         state[6 + i] += share * x[i]
     state[12] = min(max(state[12], -LARGEST_LOG_SCALE), LARGEST_LOG_SCALE)
-
-
-@bare_kernel
-def explore(work, used, starts, upright, template):  # type: ignore[no-untyped-def]
-    """Take a few steps from each of ``starts`` (S, 9), on the ``used`` points and no rays.
-
-    States and costs are left in ``work``.
-    """
-    A, x, modes, rays = work.A, work.x, np.int64(COARSE_MODES), np.int64(0)
-    for i in range(starts.shape[0]):
-        state = work.coarse[i]
-        for step in range(COARSE_STEPS + 1):
-            k, steps = COARSE_K - min(step, COARSE_STEPS - 1), step < COARSE_STEPS
-            work.costs[i] = linearise(
-                work.points, used, work.passing, rays, modes, k, upright, steps, template.rows, template.low,
-                template.voxel_m, state, work.J, A, work.told[MOST_REFINED],
-            )  # fmt: skip
-            if steps:
-                solve(A, x, 7 + modes)
-                move(state, x, 7 + modes)
-
-
-@bare_kernel
-def refine(work, used, rays, upright, template, at):  # type: ignore[no-untyped-def]
-    """Take the steps of all modes from the state ``at`` of ``work.fine``.
-
-    All ``used`` points and ``rays`` count. What the last state costs, and its covariance, are left in ``work``.
-    """
-    A, x, state, told = work.A, work.x, work.fine[at], work.told[at]
-    modes, always = np.int64(MODES), np.bool_(True)  # constants would make Numba compile linearise for each
-    for step in range(FINE_STEPS + 1):
-        k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
-        cost = linearise(
-            work.points, used, work.passing, rays, modes, k, upright, always, template.rows, template.low,
-            template.voxel_m, state, work.J, A, told,
-        )  # fmt: skip
-        told[EVIDENCE] = cost + solve(A, x, 7 + modes)
-        if step < FINE_STEPS:
-            move(state, x, 7 + modes)
-    _invert(A, x, work.covariances[at])
-
-
-@rule
-def pick(costs, count, least, coarse, fine, refined):  # type: ignore[no-untyped-def]
-    """Return the best of the ``count`` starts that is not done yet, and mark it as done; -1 where none is worth it.
-
-    The best one cost ``least``. A start that came to what was ``refined`` before is not worth it.
-    """
-    while True:
-        best = np.int64(0)
-        for i in range(count):
-            if costs[i] < costs[best]:
-                best = np.int64(i)
-        if costs[best] == np.inf or (refined >= 2 and costs[best] > least + MARGIN):
-            return np.int64(-1)
-        costs[best] = np.inf
-        known = False
-        for j in range(refined):
-            trace = 0.0
-            for q in range(3, 12):
-                trace += coarse[best, q] * fine[j, q]
-            known = known or trace > ALIKE
-        if not known:
-            return best
-
-
-@bare_kernel
-def align(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def]
-    """Try all ``starts`` (S, 9) on the ``n`` samples and ``m`` rays of ``work``, and refine the best.
-
-    ``work`` is a :class:`Scratch`, ``template`` a :class:`~headvox.template.Template`. Returned is how many were
-    refined; ``work`` has their states, what they cost and their covariances. A single start is refined at once.
-    """
-    coarse, fine, costs, count = work.coarse, work.fine, work.costs, starts.shape[0]
-    for i in range(count):
-        costs[i] = 0.0
-        for j in range(STATE):
-            coarse[i, j] = starts[i, j - 3] if 3 <= j < 12 else 0.0
-    if count > 1:
-        explore(work, choose(work.samples, n, work.points, COARSE_SAMPLES), starts, upright, template)
-    used = choose(work.samples, n, work.points, FINE_SAMPLES)
-    rays = choose(work.rays, m, work.passing, FINE_RAYS)
-    least = np.inf
-    for i in range(count):
-        least = min(least, costs[i])
-    refined = np.int64(0)
-    while refined < MOST_REFINED:
-        best = pick(costs, count, least, coarse, fine, refined)
-        if best < 0:
-            break
-        for j in range(STATE):
-            fine[refined, j] = coarse[best, j]
-        refine(work, used, rays, upright, template, refined)
-        refined += 1
-    return refined

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.align import Scratch
+from headvox.assemble import MOST_POSES
 from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.data import F64
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
 from headvox.integral import box_reach, shape_with_margins
+from headvox.pose import FitMemory
 from headvox.refine import MOST_PARTS, ROWS
 from headvox.simd import LANES
 from headvox.visibility import cells_of
@@ -59,7 +60,7 @@ class Memory:
         self.sees = cascade.source.sees  # asks every tree: not for every frame
         self.search = Stages.of(cascade.stages, self.S.dtype, threads) if cascade.stages else None
         self.judge = Stages.of(cascade.judge, self.S.dtype, threads) if cascade.judge else None
-        self.scratch = [Scratch.new() for _ in range(threads if poses else 0)]
+        self.fits = FitMemory.new(threads, MOST_POSES) if poses else FitMemory.new(0, 0)
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 

@@ -387,7 +387,7 @@ class Detector:
         if self.config.refine != "pose":
             return heads
         best = heads.centres[:MOST_POSES]
-        return with_poses(heads, fit_poses(frame, best, memory.scratch, self._threads, expected))
+        return with_poses(heads, fit_poses(frame, best, memory.fits, self._threads, expected))
 
     def _fit_spheres(self, cells: I32, memory: Memory) -> F64:
         """Return the spheres (N, 6) that fit what lies about ``cells`` (N, 3) of the integral volume."""

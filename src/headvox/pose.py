@@ -1,7 +1,7 @@
 """From a candidate to a 6-DoF head: a head template is aligned to the raw points about it.
 
-A head is tried at several yaws, the best few of which are refined (:mod:`headvox.align`). What the others cost says how
-sure the orientation is: the back of a head knows its centre, not always its yaw.
+A head is tried at several yaws, the best few of which are refined (:mod:`headvox.trials`). What the others cost says
+how sure the orientation is: the back of a head knows its centre, not always its yaw.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from headvox.align import Scratch
 from headvox.data import F64, Expected, Frame
 from headvox.nearby import gather, sensors_of
-from headvox.settle import expect_turns, fit_head
+from headvox.settle import expect_turns, settle_all
 from headvox.template import load_template
 from headvox.threads import Threads
+from headvox.trials import Scratch, Trials, list_jobs, refine_all, search
 
 YAWS = 12
 NOD_RAD = np.radians(10.0)  # people look down a little more often than up
@@ -66,28 +66,46 @@ def all_turns() -> F64:
     return np.ascontiguousarray(Rotation.create_group("I").as_matrix().reshape(-1, 9))
 
 
+class FitMemory(NamedTuple):
+    """The working memory of :func:`fit_poses`: nothing large is allocated per frame."""
+
+    scratch: list[Scratch]
+    """one a thread"""
+    trials: Trials
+
+    @classmethod
+    def new(cls, threads: int, heads: int) -> FitMemory:
+        """Return the memory for so many ``threads`` and, at most, ``heads``."""
+        return cls([Scratch.new() for _ in range(threads)], Trials.new(heads))
+
+
 def fit_poses(
-    frame: Frame, centres: F64, scratch: list[Scratch], threads: Threads, expected: Expected | None = None
+    frame: Frame, centres: F64, memory: FitMemory, threads: Threads, expected: Expected | None = None
 ) -> Poses:
     """Fit a head near each of ``centres`` (N, 3), world, metres.
 
-    ``scratch`` holds one memory a thread. A candidate within reach of a head in ``expected`` whose orientation is known
-    starts from that alone, unless the fit is poor.
+    A candidate within reach of a head in ``expected`` whose orientation is known starts from that alone, unless the fit
+    is poor.
     """
-    poses = Poses.unknown(centres)
+    poses, heads, trials = Poses.unknown(centres), len(centres), memory.trials
     first = expected_turns(centres, expected)
     sensors = sensors_of(frame)
-    parts = min(threads.count, len(centres))
     template, upright, anyhow = load_template(), upright_turns(), all_turns()
     left = count()  # whoever is free takes the next head
 
-    def fit(part: int) -> None:
-        work = scratch[part]
-        while (i := next(left)) < len(centres):
+    def find(work: Scratch) -> None:
+        while (i := next(left)) < heads:
             n, m = gather(sensors, centres[i], work.samples, work.rays)
-            fit_head(work, n, m, centres[i], first[i : i + 1], upright, anyhow, template, poses, i)
+            search(work, n, m, first[i], upright, anyhow, template, trials, i)
 
-    threads.run(fit, [(part,) for part in range(parts)])
+    threads.run(find, [(work,) for work in memory.scratch[:heads]])
+    jobs, taken = list_jobs(trials, heads), np.zeros(1, np.int64)
+
+    def improve(work: Scratch) -> None:
+        refine_all(work, trials, jobs, taken, template)
+
+    threads.run(improve, [(work,) for work in memory.scratch[:jobs]])
+    settle_all(trials, heads, centres, template, poses)
     return poses
 
 

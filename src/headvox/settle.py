@@ -2,93 +2,65 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from headvox.align import COST, CROSSED, EVIDENCE, FINE_RAYS, FINE_SAMPLES, ON_SURFACE, align
+from headvox.align import COST, CROSSED, EVIDENCE, ON_SURFACE
+from headvox.data import F64
 from headvox.kernels import bare_kernel, rule
+from headvox.trials import POINTS, RAYS, TRIED
 
-POOR = 0.5  # mean cost of a point from which on an expected orientation is not trusted
-LEAST_SAMPLES = 20  # fewer points say nothing about a pose
 SURE_YAW_RAD = np.radians(45.0)  # an orientation that is less sure is not stated
-ROUND_M = 0.14  # what counts as the head when we ask whether it was seen from all sides
-ROUND_SHARE = 0.35
+
+
+class Refined(NamedTuple):
+    """States of one head that are refined."""
+
+    states: F64
+    """(S, STATE)"""
+    told: F64
+    """(S, TOLD)"""
+    covariances: F64
+    """(S, 6, 6) of shift and turn, in the head's axes"""
 
 
 @bare_kernel
-def fit_head(work, n, m, centre, expected, upright, anyhow, template, poses, i):  # type: ignore[no-untyped-def]
-    """Fit a head to the ``n`` samples and ``m`` rays of ``work``, and write it to row ``i`` of ``poses``.
+def settle_all(trials, heads, centres, template, poses):  # type: ignore[no-untyped-def]
+    """Write the best of what was tried of each of the first ``heads`` to ``poses``."""
+    for i in range(heads):
+        refined = Refined(trials.states[i], trials.told[i], trials.covariances[i])
+        counts = trials.counts[i]
+        conclude(refined, counts[TRIED], counts[POINTS], counts[RAYS], centres[i], template, poses, i)
 
-    ``expected`` (1, 9) is the rotation to start from, NaN where none is known; else it starts from ``upright`` (U, 9),
-    or from ``anyhow`` (A, 9) where the points lie all around. Returns which of the refined states is best, and how
-    many there are: none where there are too few points.
+
+@bare_kernel
+def conclude(refined, count, points, rays, centre, template, poses, i):  # type: ignore[no-untyped-def]
+    """Write the best of the first ``count`` of :class:`Refined` states to row ``i`` of ``poses``, if there is one.
+
+    ``points`` and ``rays`` are how many they were fitted to, ``centre`` is what they are told from.
     """
-    if n < LEAST_SAMPLES:
-        return 0, 0
-    used = min(n, FINE_SAMPLES)
-    refined = 0
-    knows = True
-    for j in range(9):
-        knows = knows and np.isfinite(expected[0, j])
-    for alone in (True, False):  # from what is expected alone, then from everywhere
-        stands, starts = True, expected
-        if not alone:
-            stands = not is_round(work.samples, n)
-            starts = upright if stands else anyhow
-        if knows or not alone:
-            refined = align(work, n, m, starts, stands, template)
-            if work.told[0, COST] <= POOR * used:
-                break
     best = np.int64(0)
-    for s in range(1, refined):
-        if work.told[s, EVIDENCE] < work.told[best, EVIDENCE]:
+    for s in range(1, count):
+        if refined.told[s, EVIDENCE] < refined.told[best, EVIDENCE]:
             best = np.int64(s)
-    if refined > 0 and np.isfinite(work.told[best, EVIDENCE]):
-        poses.misfits[i] = work.told[best, COST] / used
-        poses.coverages[i] = work.told[best, ON_SURFACE] / used
-        poses.crossings[i] = work.told[best, CROSSED] / max(min(m, FINE_RAYS), 1)
-        settle(work, refined, best, centre, template, poses, i)
-    return best, refined
+    if count > 0 and np.isfinite(refined.told[best, EVIDENCE]):
+        poses.misfits[i] = refined.told[best, COST] / points
+        poses.coverages[i] = refined.told[best, ON_SURFACE] / points
+        poses.crossings[i] = refined.told[best, CROSSED] / max(rays, 1)
+        settle(refined, count, best, centre, template, poses, i)
 
 
 @bare_kernel
-def is_round(samples, n):  # type: ignore[no-untyped-def]
-    """Whether points whose sensor nobody knows lie all around: a shell, whose neck and gravity need not be right."""
-    seen, near, x, y, z = lean(samples, 0, n)
-    return not seen and near >= LEAST_SAMPLES and np.sqrt(x * x + y * y + z * z) < ROUND_SHARE * near
-
-
-@rule
-def lean(samples, first, after):  # type: ignore[no-untyped-def]
-    """Return whether a sensor is known of samples[first:after], how many are near, and the sum of their directions.
-
-    Where one is known, nothing else is told.
-    """
-    near = 0
-    x = y = z = 0.0
-    for s in range(first, after):
-        px, py, pz = samples[s, 0], samples[s, 1], samples[s, 2]
-        squared = px * px + py * py + pz * pz
-        if squared < ROUND_M * ROUND_M:
-            if samples[s, 3] != 0.0 or samples[s, 4] != 0.0 or samples[s, 5] != 0.0:
-                return True, 0, 0.0, 0.0, 0.0
-            near += 1
-            length = max(np.sqrt(squared), 1e-9)
-            x += px / length
-            y += py / length
-            z += pz / length
-    return False, near, x, y, z
-
-
-@bare_kernel
-def settle(work, refined, best, centre, template, poses, i):  # type: ignore[no-untyped-def]
-    """Write the ``best`` of the refined states to row ``i`` of ``poses``, with covariances that know of the others.
+def settle(refined, count, best, centre, template, poses, i):  # type: ignore[no-untyped-def]
+    """Write the ``best`` of ``count`` states to row ``i`` of ``poses``, with covariances that know of the others.
 
     The states are a mixture: each is as probable as its evidence says, and stands as far from the best as it does. An
     orientation whose yaw is less sure than ``SURE_YAW_RAD`` is not written.
     """
-    state = work.fine[best]
+    state = refined.states[best]
     far, turn = poses.centre_covariances[i], poses.rotation_covariances[i]
-    covariance = work.covariances[best]
+    covariance = refined.covariances[best]
     for a in range(3):
         poses.centres[i, a] = centre[a] + state[a]
         for b in range(3):
@@ -101,11 +73,11 @@ def settle(work, refined, best, centre, template, poses, i):  # type: ignore[no-
             turn[a, b] = template.turn_factor * covariance[3 + a, 3 + b]
     poses.radii[i] = template.radius_m * np.exp(state[12])
     whole = 0.0
-    for s in range(refined):
-        whole += odds(work.told, s, best, template.temperature)
-    for s in range(refined):
-        share = odds(work.told, s, best, template.temperature) / whole
-        other = work.fine[s]
+    for s in range(count):
+        whole += odds(refined.told, s, best, template.temperature)
+    for s in range(count):
+        share = odds(refined.told, s, best, template.temperature) / whole
+        other = refined.states[s]
         if s == best or not share > 0.0:
             continue
         wx, wy, wz = turn_between(state, other)

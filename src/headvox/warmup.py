@@ -11,17 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from headvox.align import Scratch
 from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
 from headvox.pipeline import Detector
-from headvox.pose import fit_poses
+from headvox.pose import FitMemory, fit_poses
 from headvox.read_masks import load_cascade
-from headvox.settle import fit_head
 from headvox.threads import Threads
 from headvox.track import Tracker
+from headvox.trials import search
 
 _ANYTHING = 1 << 40
 VOXEL_M = 0.025
@@ -44,7 +43,7 @@ def warm_up(config: DetectorConfig) -> None:
         max_height_m=6 * voxel,
         min_score=-1e6,
     )
-    if config.refine == "pose" and not _is_kept(fit_head):
+    if config.refine == "pose" and not _is_kept(search):
         nothing = subprocess.DEVNULL  # what it cannot compile is compiled here, and told here
         command = [sys.executable, "-m", "headvox.warmup"]
         with subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing):
@@ -65,10 +64,10 @@ def _search(config: DetectorConfig, voxel: float) -> None:
 
 
 def _fit() -> None:
-    scratch, threads = [Scratch.new()], Threads(1)
+    memory, threads = FitMemory.new(1, 2), Threads(1)
     for frames in _frames(VOXEL_M):
         for frame in frames:
-            fit_poses(frame, np.zeros((2, 3)), scratch, threads, _expected())
+            fit_poses(frame, np.zeros((2, 3)), memory, threads, _expected())
     threads.close()
 
 

@@ -7,23 +7,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import cuda
 
-from headvox.align import (
-    COARSE_SAMPLES,
-    FINE_RAYS,
-    FINE_SAMPLES,
-    MOST_REFINED,
-    MOST_STARTS,
-    PARAMETERS,
-    STATE,
-    TOLD,
-)
+from headvox.align import PARAMETERS, STATE, TOLD
 from headvox.assemble import MOST_POSES, SAME_HEAD_M
 from headvox.cuda import nearby, pose, refine
 from headvox.cuda.lanes import SIMULATED
 from headvox.nearby import MOST_SAMPLES, RAY, SAMPLE
 from headvox.pose import Poses, all_turns, upright_turns
 from headvox.refine import cells_about
+from headvox.settle import Refined
 from headvox.template import load_template
+from headvox.trials import COARSE_SAMPLES, FINE_RAYS, FINE_SAMPLES, MOST_REFINED, MOST_STARTS
 
 if TYPE_CHECKING:
     from headvox.cuda.search import Search
@@ -64,7 +57,8 @@ class Fits:
         self.starts = pose.Starts(
             *(_reals(rows, each, *shape) for shape in ((), (STATE,), (STATE,), (TOLD,), (6, 6)))
         )
-        self.chosen = tuple(_reals(rows, MOST_REFINED, *shape) for shape in ((STATE,), (TOLD,), (6, 6)))
+        self.picked = _reals(rows, MOST_REFINED, STATE)
+        self.chosen = Refined(*(_reals(rows, MOST_REFINED, *shape) for shape in ((STATE,), (TOLD,), (6, 6))))
         self.upright, self.anyhow = cuda.to_device(upright_turns()), cuda.to_device(all_turns())
         template = load_template()
         self.template = template._replace(
@@ -100,8 +94,8 @@ class Fits:
             self.scratch, self.starts,
         )  # fmt: skip
         pose.settle_heads[(1, frames), MOST_POSES if not SIMULATED else 2, stream](
-            counts, self.near, self.heads, self.spheres, self.turns, self.upright, self.anyhow, self.template,
-            self.starts, self.chosen, self.poses,
+            counts, self.near, self.heads, self.spheres, self.upright, self.anyhow, self.template, self.starts,
+            self.picked, self.chosen, self.poses,
         )  # fmt: skip
 
 

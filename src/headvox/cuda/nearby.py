@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numba import cuda
 
-from headvox.align import COARSE_SAMPLES, FINE_RAYS, FINE_SAMPLES, evenly
 from headvox.assemble import MOST_POSES
 from headvox.cuda.blocks import share_of, sum_rows
 from headvox.cuda.lanes import MATH, device, kernel, on_device
@@ -48,7 +47,16 @@ from headvox.nearby import (
     window,
     window_of,
 )
-from headvox.settle import LEAST_SAMPLES, ROUND_SHARE, expect_turns, lean
+from headvox.settle import expect_turns
+from headvox.trials import (
+    COARSE_SAMPLES,
+    FINE_RAYS,
+    FINE_SAMPLES,
+    LEAST_SAMPLES,
+    ROUND_SHARE,
+    evenly,
+    lean,
+)
 
 MOST_THREADS = 256  # of a block; a power of two
 SAMPLES, RAYS, ROUND = 0, 1, 2

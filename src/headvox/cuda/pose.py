@@ -13,17 +13,7 @@ import numpy as np
 from numba import cuda
 
 from headvox.align import (
-    COARSE_K,
-    COARSE_MODES,
-    COARSE_SAMPLES,
-    COARSE_STEPS,
     EVIDENCE,
-    FINE_K,
-    FINE_RAYS,
-    FINE_SAMPLES,
-    FINE_STEPS,
-    LAST_K,
-    MOST_REFINED,
     PARAMETERS,
     RESIDUAL,
     STATE,
@@ -35,7 +25,6 @@ from headvox.align import (
     add_turn,
     invert_column,
     move,
-    pick,
     weigh,
     weight_of_each,
 )
@@ -45,16 +34,23 @@ from headvox.cuda.blocks import share_of, sum_rows
 from headvox.cuda.lanes import MATH, device, kernel, on_device, wait_for_block
 from headvox.cuda.nearby import RAYS, ROUND, SAMPLES
 from headvox.cuda.suppress import HEADS
-from headvox.settle import (
-    LEAST_SAMPLES,
-    column,
-    fit_head,
-    odds,
-    quaternion_of,
-    settle,
-    turn_between,
-)
+from headvox.settle import Refined, column, conclude, odds, quaternion_of, settle, turn_between
 from headvox.template import MODES
+from headvox.trials import (
+    COARSE_K,
+    COARSE_MODES,
+    COARSE_SAMPLES,
+    COARSE_STEPS,
+    FINE_K,
+    FINE_RAYS,
+    FINE_SAMPLES,
+    FINE_STEPS,
+    LAST_K,
+    LEAST_SAMPLES,
+    MOST_REFINED,
+    is_trusted,
+    pick,
+)
 
 MOST_THREADS = 128  # of a block; a power of two
 COLUMNS = FINE_SAMPLES + FINE_RAYS
@@ -66,6 +62,7 @@ _add_prior_cost = on_device(add_prior_cost)
 _add_priors = on_device(add_priors, add_turn=on_device(add_turn))
 _invert_column = on_device(invert_column, substitute=on_device(substitute))
 _move = on_device(move, np=MATH)
+_is_trusted = on_device(is_trusted)
 _pick = on_device(pick, np=MATH)
 
 
@@ -82,21 +79,6 @@ class Starts(NamedTuple):
     """(.., starts, TOLD)"""
     covariances: Any
     """(.., starts, 6, 6)"""
-
-
-class Work(NamedTuple):
-    """What :func:`headvox.settle.fit_head` knows of a head, as :class:`headvox.align.Scratch` on the CPU."""
-
-    samples: Any
-    """Whether the points lie all around, (1,): nothing else is asked of them"""
-    costs: Any
-    coarse: Any
-    all_fine: Any
-    all_told: Any
-    all_covariances: Any
-    fine: Any
-    told: Any
-    covariances: Any
 
 
 @device
@@ -192,7 +174,7 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
         head, start = job // each, job % each
         at_head = frame * MOST_POSES + head
         n, m = near[frame, head, SAMPLES], near[frame, head, RAYS]
-        stands = start == 0 or not near[frame, head, ROUND]
+        stands = not near[frame, head, ROUND]
         there = upright.shape[0] if stands else anyhow.shape[0]
         tries = n >= LEAST_SAMPLES and start <= there
         if start == 0:
@@ -251,33 +233,44 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
 
 
 @device
-def is_round(samples, n):  # type: ignore[no-untyped-def]
-    """Return what was found when the points were gathered: see :mod:`headvox.cuda.nearby`."""
-    return samples[ROUND] != 0
+def choose_refined(costs, coarse, fine, told, covariances, points, count, picked, refined):  # type: ignore[no-untyped-def]
+    """Copy what :func:`headvox.trials.search` would refine of ``count`` starts to ``refined``; return how many.
 
-
-@device
-def choose_refined(work, n, m, starts, upright, template):  # type: ignore[no-untyped-def]
-    """As :func:`headvox.align.align`, of starts that are refined: the first, if one is asked for, or the others."""
-    count = starts.shape[0]
-    first = 0 if count == 1 else 1
-    costs, coarse, least = work.costs[first:], work.coarse[first:], MATH.inf
-    for i in range(count):
+    ``points`` is how many they were fitted to. All starts are refined; the first is what is expected, if anything is.
+    ``picked`` is working memory.
+    """
+    tried = 0
+    if costs[0] < MATH.inf:
+        for j in range(STATE):
+            picked[0, j] = fine[0, j]
+        take(fine, told, covariances, 0, refined, 0)
+        if _is_trusted(told[0], points):
+            return 1
+        tried = 1
+    least = MATH.inf
+    for i in range(1, count + 1):
         least = min(least, costs[i])
-    refined = 0
-    while refined < MOST_REFINED:
-        best = _pick(costs, count, least, coarse, work.fine, refined)
+    while tried < MOST_REFINED:
+        best = _pick(costs[1:], count, least, coarse[1:], picked, tried)
         if best < 0:
             break
         for j in range(STATE):
-            work.fine[refined, j] = work.all_fine[first + best, j]
-        for j in range(TOLD):
-            work.told[refined, j] = work.all_told[first + best, j]
-        for i in range(6):
-            for j in range(6):
-                work.covariances[refined, i, j] = work.all_covariances[first + best, i, j]
-        refined += 1
-    return refined
+            picked[tried, j] = coarse[1 + best, j]
+        take(fine, told, covariances, 1 + best, refined, tried)
+        tried += 1
+    return tried
+
+
+@device
+def take(fine, told, covariances, start, refined, at):  # type: ignore[no-untyped-def]
+    """Copy what a start came to to the row ``at`` of ``refined``."""
+    for j in range(STATE):
+        refined.states[at, j] = fine[start, j]
+    for j in range(TOLD):
+        refined.told[at, j] = told[start, j]
+    for i in range(6):
+        for j in range(6):
+            refined.covariances[at, i, j] = covariances[start, i, j]
 
 
 _quaternion_of = on_device(quaternion_of, np=MATH)
@@ -285,27 +278,31 @@ _turn_between = on_device(turn_between, np=MATH, quaternion_of=_quaternion_of, c
 _settle = on_device(
     settle, np=MATH, quaternion_of=_quaternion_of, turn_between=_turn_between, odds=on_device(odds, np=MATH)
 )
-_fit_head = on_device(fit_head, np=MATH, is_round=is_round, align=choose_refined, settle=_settle)
+_conclude = on_device(conclude, np=MATH, settle=_settle)
 
 
 @kernel
-def settle_heads(counts, near, heads, spheres, turns, upright, anyhow, template, starts, chosen, poses):  # type: ignore[no-untyped-def]
+def settle_heads(counts, near, heads, spheres, upright, anyhow, template, starts, picked, chosen, poses):  # type: ignore[no-untyped-def]
     """Choose the best state of each head, and write it to ``poses``; a thread a head.
 
-    ``chosen`` are the states that are asked for, and what is told of them, a row a head.
+    ``chosen`` are the states that are asked for, a row a head, and ``picked`` what they were when they were chosen.
     """
     frame = cuda.blockIdx.y
-    fine, told, covariances = chosen
     for head in range(cuda.grid(1), min(counts[frame, HEADS], MOST_POSES), cuda.gridsize(1)):
         i = frame * MOST_POSES + head
-        work = Work(
-            near[frame, head], starts.costs[i], starts.coarse[i], starts.fine[i], starts.told[i], starts.covariances[i],
-            fine[i], told[i], covariances[i],
-        )  # fmt: skip
-        n, m = near[frame, head, SAMPLES], near[frame, head, RAYS]
         centre = spheres[frame, heads[frame, head]]
         clear_pose(poses, i, centre)
-        _fit_head(work, n, m, centre, turns[i : i + 1], upright, anyhow, template, poses, i)
+        n = near[frame, head, SAMPLES]
+        if n < LEAST_SAMPLES:
+            continue
+        points, rays = min(n, FINE_SAMPLES), min(near[frame, head, RAYS], FINE_RAYS)
+        count = anyhow.shape[0] if near[frame, head, ROUND] else upright.shape[0]
+        refined = Refined(chosen.states[i], chosen.told[i], chosen.covariances[i])
+        tried = choose_refined(
+            starts.costs[i], starts.coarse[i], starts.fine[i], starts.told[i], starts.covariances[i], points, count,
+            picked[i], refined,
+        )  # fmt: skip
+        _conclude(refined, tried, points, rays, centre, template, poses, i)
 
 
 @device

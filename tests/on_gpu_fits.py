@@ -58,7 +58,8 @@ def test_the_same_spheres(counting):
     fits = Fits(1, len(cells), "sphere", 0.06, 1 if counting else 2, counting)
     lattice = Lattice((1.2, -0.6, 0.3), 0.06, shape, fits.subdivision, REGION)
     wanted = np.empty((len(cells), 6))
-    fit_spheres(grid, cells, 0.06, fits.subdivision, counting, np.empty((ROWS, MOST_PARTS)), wanted)
+    room = np.empty((ROWS, MOST_PARTS))
+    fit_spheres(grid.reshape(1, -1), shape, cells, 0.06, fits.subdivision, counting, room, wanted)
     assert wanted[:, COUNT].min() == 0
     assert wanted[:, COUNT].max() > 40
     for haired in (False, True):

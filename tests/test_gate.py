@@ -229,17 +229,10 @@ def test_shares_of_a_part_of_the_volume_are_together_that_part(spacing, shape):
         for parts in (1, 2, 3):
             passed = np.full(shape_of_passed(region), 0xFFFFFFFF, np.uint32)  # what an earlier frame left
             for part in range(parts):
-                gate_columns(
-                    S,
-                    region,
-                    S.shape[1] * part // parts,
-                    S.shape[1] * (part + 1) // parts,
-                    *gate_tables(gate, S.dtype),
-                    spacing,
-                    odd + margin,
-                    corners,
-                    passed,
-                )
+                share = region.copy()
+                share[:2] = region[0] + (region[1] - region[0]) * np.array([part, part + 1]) // parts
+                rows = passed[slice(*share[:2] - region[0])]
+                gate_columns(S, share, *gate_tables(gate, S.dtype), spacing, odd + margin, corners, rows)
             survivors = np.empty((cells.size, 3), np.int32)
             count = list_passed(passed, region, survivors)
             np.testing.assert_array_equal(survivors[:count] - margin, wanted)

@@ -10,11 +10,12 @@ from headvox.integral import (
     in_order,
     integral_volume,
     integrate,
+    room_for,
+    row_for,
     set_corners,
     shape_with_margins,
     with_margins,
 )
-from headvox.simd import LANES
 
 SHAPES = [(1, 1, 1), (1, 5, 2), (7, 1, 3), (6, 5, 9)]
 
@@ -41,12 +42,16 @@ def test_equals_the_naive_twin(shape, dtype, filled):
 
 
 def part_of(cells, box, first, shape, dtype, threads=1):
-    """Return the integral volume of the cells in ``box``, as ``threads`` threads make it."""
-    S, counting = np.full(shape, 77, dtype), cells.dtype != np.uint8
-    spare, row = np.full(LANES, 9, cells.dtype), np.full(shape[2] + LANES, 9, dtype)
-    for k in reversed(range(threads)):
-        rows = shape[1] * k // threads, shape[1] * (k + 1) // threads
-        integrate(cells, np.array(box), np.array(first), counting, *rows, spare, row, S)
+    """Return the integral volume of the cells in ``box``, which ``threads`` threads entered, each some of them."""
+    S, counting, row = np.full(shape, 77, dtype), cells.dtype != np.uint8, row_for(shape[2], dtype)
+    row[:] = 9  # what an earlier frame left
+    grids = np.full((threads, room_for(cells.size)), 200, cells.dtype)
+    left, whole = cells.reshape(-1).copy(), (1 << 32) - 1 if counting else 255
+    for grid in grids[1:, : cells.size]:
+        grid[:] = left & np.random.default_rng(1).integers(0, whole, cells.size)
+        left -= grid
+    grids[0, : cells.size] = left
+    integrate(grids, cells.shape, np.array(box), np.array(first), counting, row, S)
     return in_order(S)
 
 

@@ -243,6 +243,24 @@ def test_many_heads_outgrow_the_memory_for_candidates(make):
     assert everything(one.detect(few)) == everything(two.detect(few)) == wanted
 
 
+@pytest.mark.parametrize("cascade", ["stages", "fourth", "votes", "default"])
+def test_heads_on_both_sides_of_where_the_volume_is_cut(make, cascade):
+    """Busts a voxel apart in x, so that some lie on every seam, where their neighbours belong to another slab."""
+    rng = np.random.default_rng(5)
+    places = [(0.05 * k - 1.4, 0.4 * (k % 7) - 1.2, 0.1) for k in range(56)]
+    cloud = np.concatenate([scenes.bust(rng, place, 400) for place in places])
+    settings = {"max_range_m": 2.0, "min_score": 0.0}
+    wanted = make(cascade, **settings).detect(cloud)
+    assert len(wanted) > 20
+    for threads in (2, 3):
+        detector = make(cascade, threads=threads, **settings)
+        assert everything(detector.detect(cloud)) == everything(wanted)
+        seams = detector._memory.slabs.seams
+        assert 0 < len(seams) < threads
+        at = detector._memory.lattice.centres(detector._memory.first + np.stack([seams] * 3, axis=1))[:, 0]
+        assert (np.abs(wanted.centres[:, 0] - at[:, None]).min(axis=1) < 0.1).all()
+
+
 def test_a_frame_that_fails_midway_leaves_nothing_behind(make, monkeypatch):
     detector = make(min_score=-1.0)
     wanted = everything(detector.detect(two_busts(0)))

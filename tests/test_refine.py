@@ -11,7 +11,9 @@ from headvox.voxelize import Lattice, voxelize_points
 def fitted(cells, peaks, voxel=0.05, subdivision=2, counting=False):
     spheres = np.empty((len(peaks), 6))
     room = np.empty((ROWS, MOST_PARTS))
-    fit_spheres(cells, np.array(peaks, np.int32), voxel, subdivision, counting, room, spheres)
+    halves = cells.reshape(1, -1) & np.where(np.arange(cells.size) % 3, 0x5A, 0xA5)[None].astype(cells.dtype)
+    grids = np.concatenate([halves, cells.reshape(1, -1) - halves])  # as two threads enter them
+    fit_spheres(grids, cells.shape, np.array(peaks, np.int32), voxel, subdivision, counting, room, spheres)
     return spheres
 
 

@@ -15,20 +15,23 @@ from headvox.simd import (
     below,
     bit_and,
     bit_counts,
+    bit_or,
     choose,
     compress,
     equal,
-    evens,
     fill,
+    firsts,
     larger,
     last,
     less,
     load,
+    load_pairs,
     load_triples,
     lowest,
     mul,
-    odds,
+    resized,
     running_sums,
+    seconds,
     shift_left,
     shift_right,
     shifted,
@@ -40,7 +43,6 @@ from headvox.simd import (
     to_int,
     total,
     where,
-    widen,
     within,
 )
 
@@ -62,13 +64,13 @@ def arithmetic(a, b, at, factor, out):
 
 @bare_kernel
 def in_rows(a, at, count, out, wide):
-    """Write what is done within the lanes of one vector to a row of ``out`` each, and the lanes widened to ``wide``."""
+    """Write what is done within the lanes of one vector to a row of ``out`` each, and the lanes resized to ``wide``."""
     x, flat = load(a, at), out.reshape(-1)
     store(flat, 0, running_sums(x))
     store(flat, LANES, last(x))
     store(flat, 2 * LANES, beginning(x, count))
     store(flat, 3 * LANES, bit_counts(x))
-    store(wide, 0, widen(x, load(wide, 0)))
+    store(wide, 0, resized(x, load(wide, 0)))
 
 
 @bare_kernel
@@ -82,8 +84,14 @@ def integers(a, b, at, out):
     store(flat, 4 * LANES, where(below(x, y), x, y))
     store(flat, 5 * LANES, where(equal(x, y), x, fill(b[at])))
     store(flat, 6 * LANES, shift_left(x, 3))
-    store(flat, 7 * LANES, evens(x, y))
-    store(flat, 8 * LANES, odds(x, y))
+    store(flat, 7 * LANES, bit_or(x, y))
+
+
+@bare_kernel
+def paired(a, at, out):
+    pairs, flat = load_pairs(a, at), out.reshape(-1)
+    store(flat, 0, resized(firsts(pairs), load(a, 0)))
+    store(flat, LANES, resized(seconds(pairs), load(a, 0)))
 
 
 @bare_kernel
@@ -150,7 +158,7 @@ def test_integers_equal_numpy(dtype):
     info = np.iinfo(dtype)
     a, b = rng.integers(info.min, info.max, (2, 40), dtype, endpoint=True)
     b[::3] = a[::3]
-    out = np.zeros((9, LANES), dtype)
+    out = np.zeros((8, LANES), dtype)
     integers(a, b, 2, out)
     x, y = a[2 : 2 + LANES], b[2 : 2 + LANES]
     rows = [
@@ -161,10 +169,17 @@ def test_integers_equal_numpy(dtype):
         np.minimum(x, y),
         np.where(x == y, x, y[0]),
         x << 3,
-        np.concatenate([x[0::2], y[0::2]]),
-        np.concatenate([x[1::2], y[1::2]]),
+        x | y,
     ]
     np.testing.assert_array_equal(out, rows)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint32])
+def test_pairs_come_apart(dtype):
+    a = np.random.default_rng(4).integers(0, np.iinfo(dtype).max, 2 * LANES + 3, dtype, endpoint=True)
+    out = np.zeros((2, LANES), dtype)
+    paired(a, 3, out)
+    np.testing.assert_array_equal(out, [a[3::2], a[4::2]])
 
 
 def test_reals_equal_numpy_and_a_nan_is_below_nothing():

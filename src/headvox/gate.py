@@ -61,7 +61,7 @@ def holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[n
 
 @bare_kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S, region, y_first, y_last, weights, spans, rank, limits, spacing, odd, corners, passed
+    S, region, weights, spans, rank, limits, spacing, odd, corners, passed
 ):
     """Write to ``passed`` (nx, ny, words a column) a bit for each voxel of ``region``: whether it passes.
 
@@ -69,14 +69,14 @@ def gate_columns(  # type: ignore[no-untyped-def]
     ``region`` is x0 x1 y0 y1 z0 z1; S, in halves, has margins about it, see
     :func:`headvox.integral.shape_with_margins`. With ``odd`` (3,) added to x, y and z, all voxels count (``spacing``
     1), those whose x + y + z is even (2), or those whose x, y and z are all even or all odd (4). ``corners`` are those
-    of the gate's boxes. Only the columns ``y_first`` to ``y_last`` of S are done.
+    of the gate's boxes.
     """
     flat = S.reshape(-1)
     x0, y0, bottom, height = region[0], region[2], region[4], region[5] - region[4]
     odd_column, odd_z = odd[0] + odd[1], (odd[0] if spacing == 4 else odd[0] + odd[1]) + odd[2] + bottom
     # A few slices go side by side, because they share most of what their boxes look up.
     for block in range(x0, region[1], SLICES):
-        for y in range(max(y_first, y0), min(y_last, region[3])):
+        for y in range(y0, region[3]):
             for x in range(block, min(block + SLICES, region[1])):
                 column = (x * S.shape[1] + y) * S.shape[2]
                 words = passed[np.uint64(x - x0), np.uint64(y - y0)]
@@ -180,7 +180,7 @@ def pass_gate(S: Integral, gate: CompiledGate, odd: npt.ArrayLike = (0, 0, 0)) -
     set_corners(longer, gate.boxes, corners)
     tables = gate_tables(gate, S.dtype)
     at = gate.spacing, np.asarray(odd) + low
-    gate_columns(longer, region, 0, longer.shape[1], *tables, *at, corners, passed)
+    gate_columns(longer, region, *tables, *at, corners, passed)
     survivors = np.empty((sum(int(bits).bit_count() for bits in passed[passed > 0]), 3), np.int32)
     list_passed(passed, region, survivors)
     return survivors - low.astype(np.int32)

@@ -25,17 +25,22 @@ from headvox.simd import (
     add,
     beginning,
     bit_counts,
-    evens,
+    bit_or,
+    firsts,
     last,
     load,
-    odds,
+    load_pairs,
+    resized,
     running_sums,
+    seconds,
     store,
     sub,
-    widen,
+    where,
 )
 
 Integral = npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
+
+FIRST_HALF = np.uint32((1 << LANES // 2) - 1)
 
 
 @rule
@@ -45,99 +50,85 @@ def place(z, half):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def integrate(cells, box, first, counting, y_first, y_last, spare, row, S):  # type: ignore[no-untyped-def]
-    """Fill the columns ``y_first`` to ``y_last`` of ``S`` with the integral volume of the cells in ``box``, in halves.
+def integrate(grids, shape, box, first, counting, row, S):  # type: ignore[no-untyped-def]
+    """Fill ``S`` with the integral volume of the cells in ``box``, its columns in halves.
 
-    ``box`` is lowest and highest cell (inclusive); what lies outside of it counts as empty. S[0, 0, 0] is at the lower
-    corner of the cell ``first``, which may lie before the grid, and S may go on behind it: see
-    :func:`shape_with_margins` for its shape, and :func:`place` for the order of a column. A parts grid is summed by its
-    bits. ``spare`` (LANES cells) and ``row`` (LANES more than S is high) are working memory.
+    ``grids`` (G, see :func:`room_for`) are the cells of a lattice of ``shape`` as several threads entered them, each
+    some of the readings; a parts grid is summed by its bits. ``box`` is lowest and highest cell (inclusive); what lies
+    outside of it counts as empty. S[0, 0, 0] is at the lower corner of the cell ``first``, which may lie before the
+    grid, and S may go on behind it: see :func:`shape_with_margins` for its shape, and :func:`place` for the order of a
+    column. ``row``, see :func:`row_for`, is working memory.
     """
-    flat, grid = S.reshape(-1), cells.reshape(-1)
-    columns, length = S.shape[1], S.shape[2]
-    bottom, height = box[2] - first[2] + 1, box[5] - box[2] + 1
+    flat, cells = S.reshape(-1), grids.reshape(-1)
+    columns, length, step = S.shape[1], S.shape[2], shape[2]
+    bottom, height, half = box[2] - first[2] + 1, box[5] - box[2] + 1, length // 2
+    lowest, highest = box[1] - first[1] + 1, box[4] - first[1] + 1  # the columns of S with cells of their own
     none = load(row, 0)
     none = sub(none, none)
-    for z in range(y_first * length, y_last * length, LANES):
+    for z in range(0, columns * length, LANES):
         store(flat, z, none)
     for x in range(S.shape[0] - 1):
-        for z in range(0, row.shape[0], LANES):
+        for z in range(0, length + LANES, LANES):
             store(row, z, none)
-        slice_at = ((first[0] + x) * cells.shape[1] + first[1] - 1) * cells.shape[2] + box[2]
+        slice_at = ((first[0] + x) * shape[1] + first[1] - 1) * step + box[2]
         occupied = box[0] <= first[0] + x <= box[3]
-        lowest, highest = (
-            box[1] - first[1] + 1,
-            box[4] - first[1] + 1,
-        )  # the columns of S with cells of their own
-        before = min(y_first - 1, highest) - lowest + 1
-        if occupied and before > 0:
-            at = slice_at + lowest * cells.shape[2]
-            _add_many(grid, at, before, cells.shape[2], height, counting, spare, row, bottom)
-        for y in range(y_first, y_last):
+        for y in range(columns):
             if occupied and lowest <= y <= highest:
-                at = slice_at + y * cells.shape[2]
-                _add_columns(grid, at, 1, cells.shape[2], height, counting, spare, row, bottom)
+                _add_column(cells, slice_at + y * step, grids, height, counting, row, bottom, half)
             here = (x * columns + y) * length
             after = here + columns * length
             for z in range(0, length, LANES):
-                store(flat, after + z, add(load(flat, here + z), load(row, z)))
+                store(flat, after + z, add(load(flat, here + z), _sums_at(row, z, half)))
 
 
 @rule
-def _add_columns(grid, at, many, step, height, counting, spare, row, bottom):  # type: ignore[no-untyped-def]
-    """Add to ``row``, from ``bottom`` on, what is in ``many`` columns together, up to each of their cells.
-
-    The first begins at ``at``, the next one a ``step`` further.
-    """
-    half = (row.shape[0] - LANES) // 2
-    lower, upper = place(bottom, half), place(bottom + 1, half)  # of the first two cells
-    lower_end = half if lower < half else 2 * half
-    upper_end = 3 * half - lower_end
+def _add_column(cells, at, grids, height, counting, row, bottom, half):  # type: ignore[no-untyped-def]
+    """Add to ``row``, from ``bottom`` on, what is in the column at ``at`` up to each of its cells."""
+    lower, upper = place(bottom, half + LANES), place(bottom + 1, half + LANES)  # of the first two cells
     total = load(row, 0)
     total = sub(total, total)
     for z in range(0, height, 2 * LANES):
-        some, more = _amounts(grid, at, z, height, counting, spare)
-        one, other = widen(evens(some, more), total), widen(odds(some, more), total)
-        for column in range(1, many):
-            some, more = _amounts(grid, at + column * step, z, height, counting, spare)
-            one = add(one, widen(evens(some, more), total))
-            other = add(other, widen(odds(some, more), total))
+        pairs = load_pairs(cells, at + z)
+        for grid in range(1, grids.shape[0]):
+            other = load_pairs(cells, at + z + grid * grids.shape[1])
+            pairs = add(pairs, other) if counting else bit_or(pairs, other)
+        evens = beginning(firsts(pairs), (height - z + 1) // 2)
+        odds = beginning(seconds(pairs), (height - z) // 2)
+        if not counting:
+            evens, odds = bit_counts(evens), bit_counts(odds)
+        one, other = resized(evens, total), resized(odds, total)
         sums = add(running_sums(add(one, other)), total)
         k = z // 2
-        below = beginning(sub(sums, other), lower_end - lower - k)
-        store(row, lower + k, add(load(row, lower + k), below))
-        store(row, upper + k, add(load(row, upper + k), beginning(sums, upper_end - upper - k)))
+        store(row, lower + k, add(load(row, lower + k), sub(sums, other)))
+        store(row, upper + k, add(load(row, upper + k), sums))
         total = last(sums)
     done = (height + 2 * LANES - 1) // (2 * LANES) * LANES
-    for k in range(lower + done, lower_end, LANES):
-        store(row, k, add(load(row, k), beginning(total, lower_end - k)))
-    for k in range(upper + done, upper_end, LANES):
-        store(row, k, add(load(row, k), beginning(total, upper_end - k)))
+    for k in range(done, half - bottom // 2, LANES):
+        store(row, lower + k, add(load(row, lower + k), total))
+        store(row, upper + k, add(load(row, upper + k), total))
 
 
-@bare_kernel
-def _add_many(grid, at, many, step, height, counting, spare, row, bottom):  # type: ignore[no-untyped-def]
-    """As :func:`_add_columns`, which is made anew wherever it is called, for this number of columns or for that."""
-    _add_columns(grid, at, many, step, height, counting, spare, row, bottom)
+def room_for(cells: int) -> int:
+    """Return how long a grid of so many cells has to be: vectors that begin at its last cell go on behind it."""
+    return cells + 2 * LANES
+
+
+def row_for(length: int, sum_type: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Return the working memory for columns so long: two halves, each with a vector of room behind it.
+
+    So what is written to one half never lies where the other is read next, which a processor would wait for.
+    """
+    return np.zeros(length + 2 * LANES, sum_type)
 
 
 @rule
-def _amounts(grid, at, z, height, counting, spare):  # type: ignore[no-untyped-def]
-    """Return what two vectors of cells of a column hold, from ``z`` on: 0 from ``height`` on."""
-    some = _amount(grid, at, z, height, counting, spare)
-    return some, _amount(grid, at, z + LANES, height, counting, spare)
-
-
-@rule
-def _amount(grid, at, z, height, counting, spare):  # type: ignore[no-untyped-def]
-    if at + z + LANES <= grid.shape[0]:
-        cells = load(grid, at + z)
-    else:
-        for k in range(min(height - z, LANES)):
-            spare[k] = grid[at + z + k]
-        cells = load(spare, 0)
-    cells = beginning(cells, height - z)
-    return cells if counting else bit_counts(cells)
+def _sums_at(row, z, half):  # type: ignore[no-untyped-def]
+    """Return a vector of a column in halves from ``z`` on, of which ``row`` holds the halves apart."""
+    if z + LANES <= half:
+        return load(row, z)
+    if z >= half:
+        return load(row, z + LANES)
+    return where(FIRST_HALF, load(row, z), load(row, z + LANES))  # as many of the one half as of the other
 
 
 @rule
@@ -186,8 +177,10 @@ def integral_volume(cells: npt.NDArray[Any], narrow: bool = False) -> Integral:
     nx, ny, nz = cells.shape
     S: npt.NDArray[Any] = np.empty((nx + 1, ny + 1, _rounded_up(nz + 1)), np.uint16 if narrow else np.uint32)
     box = np.array([0, 0, 0, nx - 1, ny - 1, nz - 1], dtype=np.int64)
-    memory = np.zeros(LANES, cells.dtype), np.zeros(S.shape[2] + LANES, S.dtype)
-    integrate(cells, box, np.zeros(3, np.int64), cells.dtype != np.uint8, 0, ny + 1, *memory, S)
+    grid = np.zeros((1, room_for(cells.size)), cells.dtype)
+    grid[0, : cells.size] = cells.reshape(-1)
+    row = row_for(S.shape[2], S.dtype)
+    integrate(grid, cells.shape, box, np.zeros(3, np.int64), cells.dtype != np.uint8, row, S)
     return in_order(S)[:, :, : nz + 1].copy()
 
 

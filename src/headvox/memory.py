@@ -13,10 +13,11 @@ from headvox.assemble import MOST_POSES
 from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.data import F64
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
-from headvox.integral import box_reach, shape_with_margins
+from headvox.integral import box_reach, room_for, row_for, shape_with_margins
 from headvox.pose import FitMemory
 from headvox.refine import MOST_PARTS, ROWS
 from headvox.simd import LANES
+from headvox.slabs import Slabs, cut
 from headvox.visibility import cells_of
 from headvox.vote import StageTables, seen_boxes
 from headvox.voxelize import Lattice, Marking, empty
@@ -32,21 +33,21 @@ class Memory:
         counting = cascade.source.counting
         cell_type = np.uint32 if counting else np.uint8
         sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
-        cells = math.prod(lattice.shape)
         self.place(lattice)
         self.dirty: tuple[int, int] | None = (0, 0)
-        self.flat = [np.zeros(cells, cell_type) for _ in range(threads)]
-        self.cells = [flat.reshape(lattice.shape) for flat in self.flat]
+        self.grids = np.zeros((threads, room_for(math.prod(lattice.shape))), cell_type)
+        """The cells as each thread entered them, see :func:`headvox.integral.integrate`."""
         self.marking = [Marking.of(LANES) for _ in range(threads)]
-        tables = [part.boxes for part in (cascade.gate, cascade.stages) if part is not None]
+        tables = [part.boxes for part in (cascade.gate, cascade.stages, cascade.votes) if part is not None]
+        if cascade.votes is not None:
+            tables.append(cascade.votes.pairs.reshape(-1, 6))
         if cascade.judge is not None:  # it looks at the neighbours of candidates, too
             tables += [cascade.judge.boxes + one for one in (-1, 1)]
         self.reach = box_reach(np.concatenate(tables))
-        shape = shape_with_margins(lattice.shape, self.reach)
-        self.S = np.empty(math.prod(shape), sum_type)
-        self.spare = [np.zeros(LANES, cell_type) for _ in range(threads)]
-        self.row = [np.zeros(shape[2] + LANES, sum_type) for _ in range(threads)]
-        self.index = np.zeros(math.prod(shape), np.int32)
+        slices, *slice_shape = shape_with_margins(lattice.shape, self.reach)
+        self.S = np.empty(self.cut(lattice.shape[0], threads).slices * math.prod(slice_shape), sum_type)
+        self.row = [row_for(slice_shape[1], sum_type) for _ in range(threads)]
+        self.index = np.zeros(slices * math.prod(slice_shape), np.int32)
         self.first = np.zeros(3, np.int64)
         """The cell that the integral volume begins at."""
         self.gate = gate_tables(cascade.gate, self.S.dtype)
@@ -70,9 +71,15 @@ class Memory:
         It does so just before it marks the cells: they are in its cache then.
         """
         if dirty is None:
-            empty(self.flat[part])
-        elif part == 0:  # the others' were emptied when they were merged
-            empty(self.cells[0][dirty[0] : dirty[1]].reshape(-1))
+            empty(self.grids[part])
+        else:
+            a_slice = math.prod(self.lattice.shape[1:])
+            empty(self.grids[part, dirty[0] * a_slice : dirty[1] * a_slice])
+
+    def cut(self, slices: int, threads: int) -> Slabs:
+        """Cut the volume about so many ``slices`` of candidates into slabs."""
+        self.slabs = cut(slices, int(self.reach[0]), int(self.reach[1]), threads)
+        return self.slabs
 
     def candidates_about(self, occupied: I64) -> I64:
         """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""

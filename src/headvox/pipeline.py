@@ -29,7 +29,7 @@ from headvox.placing import Placing
 from headvox.pose import fit_poses
 from headvox.read_masks import load_cascade
 from headvox.refine import fit_spheres
-from headvox.simd import LANES
+from headvox.slabs import shares_of
 from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, local_maxima
 from headvox.threads import Threads
 from headvox.visibility import count_states, look_about
@@ -37,7 +37,6 @@ from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import (
     mark_depth,
     mark_points,
-    merge,
     new_blocks,
     new_box,
     part_transform,
@@ -203,7 +202,7 @@ class Detector:
         def mark(part: int) -> None:
             memory.clear(part, dirty)
             common = (limits, memory.bits, shape, shift, counting)
-            cells, marking, box = memory.flat[part], memory.marking[part], boxes[part]
+            cells, marking, box = memory.grids[part], memory.marking[part], boxes[part]
             for cloud, taken in zip(frame.clouds, blocks, strict=False):
                 T = part_transform(cloud, lattice)
                 mark_points(read_only(cloud.points), taken, T, *common, *marking.for_points(), box, cells)
@@ -219,30 +218,22 @@ class Detector:
         if box[3] < 0:
             memory.dirty = (0, 0)
             raise nothing_in_range(frame, lattice.region)
-        if parts > 1:
-            low, high = memory.dirty
-
-            def join(part: int) -> None:
-                filled = slice(low + (high - low) * part // parts, low + (high - low) * (part + 1) // parts)
-                for cells in memory.cells[1:]:
-                    merge(memory.cells[0][filled].reshape(-1), cells[filled].reshape(-1), counting)
-
-            self._threads.run(join, [(part,) for part in range(parts)])
         return box
 
     def _integrate(self, memory: Memory, occupied: I64, candidates: I64) -> npt.NDArray[Any]:
         """Return the integral volume about the box ``candidates``, with margins for whatever box is looked up there."""
-        shape = shape_with_margins(tuple((candidates[3:] - candidates[:3] + 1).tolist()), memory.reach)
+        slices, *rest = (candidates[3:] - candidates[:3] + 1).tolist()
+        slabs = memory.cut(slices, self._threads.count)
+        shape = (slabs.slices, *shape_with_margins((slices, *rest), memory.reach)[1:])
         S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
         memory.first = candidates[:3] + memory.reach[0::2]
-
-        def add_up(part: int, low: int, high: int) -> None:
-            integrate(
-                memory.cells[0], occupied, memory.first, self.cascade.source.counting, low, high,
-                memory.spare[part], memory.row[part][: shape[2] + LANES], S,
-            )  # fmt: skip
-
-        self._threads.run(add_up, _shares(shape[1], self._threads.count))
+        common = (memory.grids, memory.lattice.shape, occupied)
+        counting = self.cascade.source.counting
+        calls = [
+            (*common, memory.first + slab.shift, counting, row, S[slab.slices])
+            for slab, row in zip(slabs.each, memory.row, strict=False)
+        ]
+        self._threads.run(integrate, calls)
         return S
 
     def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: Memory) -> I32:
@@ -253,14 +244,14 @@ class Detector:
         passed = memory.passed[: math.prod(shape)].reshape(shape)
         odd = memory.odd + memory.first
         set_corners(S, self.cascade.gate.boxes, memory.gate_corners)
-
-        def sweep(_: int, low: int, high: int) -> None:
-            gate_columns(
-                S, region, low, high, *memory.gate, self.cascade.gate.spacing, odd, memory.gate_corners, passed
-            )  # fmt: skip
-
-        # The columns that a thread has added up: they are in its own cache.
-        self._threads.run(sweep, _shares(S.shape[1], self._threads.count))
+        common, calls = (*memory.gate, self.cascade.gate.spacing), []
+        for slab in memory.slabs.each:
+            part = region.copy()
+            part[1] = part[0] + slab.end - slab.first
+            bits = passed[slab.first : slab.end]
+            calls.append((S[slab.slices], part, *common, odd + slab.shift, memory.gate_corners, bits))
+        # The slab that a thread has added up: it is in its own cache.
+        self._threads.run(gate_columns, calls)
         self.candidates = list_passed(passed, region, memory.survivors)
         if self.candidates > len(memory.survivors):
             memory.survivors = np.empty((2 * self.candidates, 3), np.int32)
@@ -278,9 +269,9 @@ class Detector:
 
             def vote(_: int, low: int, high: int) -> None:
                 limits = (votes.asymmetry_cost, votes.min_votes)
-                vote_masks(S, survivors, low, high, *table, *limits, scores, memory.yaws)
+                vote_masks(S, *memory.slabs[1:], survivors, low, high, *table, *limits, scores, memory.yaws)
 
-            self._threads.run(vote, _shares(len(survivors), self._threads.count))
+            self._threads.run(vote, shares_of(len(survivors), self._threads.count))
         return scores
 
     def _score(
@@ -292,16 +283,19 @@ class Detector:
         last = len(compiled.stage_keep) if all_stages else compiled.occupied_stages
         set_corners(S, compiled.boxes, stages.corners)
 
-        def score(part: int, low: int, high: int) -> None:
-            vote_stages(
-                S, cells, seen, low, high, last, *stages.tables, stages.corners, memory.alive, *stages.memory[part],
-                scores,
-            )  # fmt: skip
-
-        self._threads.run(score, _shares(len(cells), 1 if len(cells) < FEW else self._threads.count))
+        common = (last, *stages.tables, stages.corners, memory.alive)
+        calls = [
+            (S, *memory.slabs[1:], cells, seen, low, high, *common, *stages.memory[part], scores)
+            for part, low, high in shares_of(len(cells), 1 if len(cells) < FEW else self._threads.count)
+        ]
+        self._threads.run(vote_stages, calls)
 
     def _suppress(self, S: npt.NDArray[Any], survivors: I32, scores: I64, memory: Memory) -> I64:
-        shape = tuple(n - 1 for n in S.shape)
+        shape = (
+            S.shape[0] - len(memory.slabs.seams) * memory.slabs.overlap - 1,
+            S.shape[1] - 1,
+            S.shape[2] - 1,
+        )
         index = memory.index[: math.prod(shape)].reshape(shape)
         reach = PEAK_REACH[self.cascade.gate.spacing]
         peaks = memory.peaks[: local_maxima(survivors, scores, DROPPED + 1, reach, index, memory.peaks)]
@@ -355,14 +349,18 @@ class Detector:
         seen = np.empty((len(cells), len(judge.offset_start) - 1, 2), np.int32)
         views = [self._placing.view(image, memory.lattice) for image in frame.depths]
 
-        def look(_: int, low: int, high: int) -> None:
-            for image, (__, table) in zip(frame.depths, views, strict=True):
-                look_about(
-                    read_only(image.depth), table, in_lattice[low:high], judge.offsets, states[low:high]
-                )
-            count_states(states[low:high], judge.offset_start, seen[low:high])
+        cameras = [
+            (read_only(image.depth), table) for image, (_, table) in zip(frame.depths, views, strict=True)
+        ]
 
-        self._threads.run(look, _shares(len(cells), self._threads.count))
+        def look(cells: I32, states: npt.NDArray[np.uint8], seen: I32) -> None:
+            for depth, table in cameras:
+                look_about(depth, table, cells, judge.offsets, states)
+            count_states(states, judge.offset_start, seen)
+
+        shares = shares_of(len(cells), self._threads.count)
+        calls = [(in_lattice[low:high], states[low:high], seen[low:high]) for _, low, high in shares]
+        self._threads.run(look, calls)
         scores = np.empty(len(cells), np.int64)
         self._score(S, cells, seen, judge, memory, scores, all_stages=True)
         return scores
@@ -395,13 +393,19 @@ class Detector:
         lattice, counting = memory.lattice, self.cascade.source.counting
         in_lattice = cells + memory.first.astype(np.int32)
 
-        def fit(part: int, low: int, high: int) -> None:
-            fit_spheres(
-                memory.cells[0], in_lattice[low:high], lattice.voxel_m, lattice.subdivision, counting,
-                memory.parts[part], spheres[low:high],
-            )  # fmt: skip
-
-        self._threads.run(fit, _shares(len(cells), self._threads.count))
+        common = (lattice.voxel_m, lattice.subdivision, counting)
+        calls = [
+            (
+                memory.grids,
+                lattice.shape,
+                in_lattice[low:high],
+                *common,
+                memory.parts[part],
+                spheres[low:high],
+            )
+            for part, low, high in shares_of(len(cells), self._threads.count)
+        ]
+        self._threads.run(fit_spheres, calls)
         return spheres
 
     # -------------------------------------------------------------------------------------------- working memory
@@ -420,15 +424,3 @@ class Detector:
 
 def _warn(text: str) -> None:
     warnings.warn(f"headvox: {text}", RuntimeWarning, stacklevel=4)
-
-
-def _share(count: int, part: int, parts: int) -> tuple[int, int]:
-    """Return the half-open range of ``count`` things that the ``part``-th of ``parts`` threads does."""
-    first, after = (-(-count * k // parts) for k in (part, part + 1))
-    return first, after
-
-
-def _shares(count: int, parts: int) -> list[tuple[int, int, int]]:
-    """Return part, first and end of the ``count`` things that each of ``parts`` threads does, if it does any."""
-    parts = min(parts, count)
-    return [(part, *_share(count, part, parts)) for part in range(parts)]

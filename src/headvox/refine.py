@@ -46,15 +46,19 @@ def part_at(a, b, c, part, voxel_m, part_m):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _gather(cells, x, y, z, voxel_m, subdivision, counting, room):  # type: ignore[no-untyped-def]
+def _gather(grids, shape, x, y, z, voxel_m, subdivision, counting, room):  # type: ignore[no-untyped-def]
     """Write the parts near the voxel, in metres from its centre, to ``room``; return how many."""
     reach = int(np.ceil(REACH_M / voxel_m))
     part_m = voxel_m / subdivision
     found = 0
-    for a in range(max(x - reach, 0), min(x + reach + 1, cells.shape[0])):
-        for b in range(max(y - reach, 0), min(y + reach + 1, cells.shape[1])):
-            for c in range(max(z - reach, 0), min(z + reach + 1, cells.shape[2])):
-                value = cells[a, b, c]
+    for a in range(max(x - reach, 0), min(x + reach + 1, shape[0])):
+        for b in range(max(y - reach, 0), min(y + reach + 1, shape[1])):
+            column = (a * shape[1] + b) * shape[2]
+            for c in range(max(z - reach, 0), min(z + reach + 1, shape[2])):
+                at = np.uint64(column + c)  # a signed index costs a check for counting from the end
+                value = np.int64(grids[0, at])
+                for grid in range(1, grids.shape[0]):
+                    value |= np.int64(grids[grid, at])
                 if value == 0:
                     continue
                 bits = 1 if counting else int(value)
@@ -131,15 +135,17 @@ def take_step(sums, A, b, sphere):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fit_spheres(cells, peaks, voxel_m, subdivision, counting, room, spheres):  # type: ignore[no-untyped-def]
+def fit_spheres(grids, shape, peaks, voxel_m, subdivision, counting, room, spheres):  # type: ignore[no-untyped-def]
     """Fit a sphere about each of ``peaks`` (N, 3); write x, y, z (m, from the voxel's centre), radius, rms and count.
 
-    Gauss-Newton on the residuals |p - c| - r, weighted 1 / (1 + (residual / sigma)²), with Gaussian priors. ``room``
-    (ROWS, parts) is working memory.
+    ``grids`` are the cells of a lattice of ``shape``, see :func:`headvox.integral.integrate`. Gauss-Newton on the
+    residuals |p - c| - r, weighted 1 / (1 + (residual / sigma)²), with Gaussian priors. ``room`` (ROWS, parts) is
+    working memory.
     """
     A, b, sums = np.empty((4, 4)), np.empty(4), np.empty(SUMS)
     for i in range(peaks.shape[0]):
-        count = _gather(cells, peaks[i, 0], peaks[i, 1], peaks[i, 2], voxel_m, subdivision, counting, room)
+        at = peaks[i]
+        count = _gather(grids, shape, at[0], at[1], at[2], voxel_m, subdivision, counting, room)
         sphere = spheres[i]
         sphere[:] = 0.0
         sphere[RADIUS] = RADIUS_M

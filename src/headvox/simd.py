@@ -89,6 +89,40 @@ def load_triples(typingctx, flat, at):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def load_pairs(typingctx, flat, at):  # type: ignore[no-untyped-def]
+    """Return the unsigned ``flat[at : at + 2 * LANES]`` in pairs, two numbers in a lane twice as wide."""
+    bits = 2 * flat.dtype.bitwidth
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        pointer = _pointer(context, builder, signature, arguments)
+        return builder.load(builder.bitcast(pointer, _vector(bits).as_pointer()), align=_size(flat.dtype))
+
+    return Lanes(types.Integer.from_bitwidth(bits))(flat, at), emit
+
+
+@intrinsic
+def firsts(typingctx, pairs):  # type: ignore[no-untyped-def]
+    """Return the first number of each pair, in a lane as wide as a pair's: see :func:`load_pairs`."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        half = ir.IntType(pairs.scalar.bitwidth // 2)
+        return builder.zext(builder.trunc(arguments[0], ir.VectorType(half, LANES)), arguments[0].type)
+
+    return pairs(pairs), emit
+
+
+@intrinsic
+def seconds(typingctx, pairs):  # type: ignore[no-untyped-def]
+    """Return the second number of each pair, in a lane as wide as a pair's: see :func:`load_pairs`."""
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        half = ir.Constant(arguments[0].type.element, pairs.scalar.bitwidth // 2)
+        return builder.lshr(arguments[0], _spread(builder, half))
+
+    return pairs(pairs), emit
+
+
+@intrinsic
 def add(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return a + b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.add(x, y), lambda builder, x, y: builder.fadd(x, y))
@@ -110,6 +144,12 @@ def mul(typingctx, a, b):  # type: ignore[no-untyped-def]
 def bit_and(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return a & b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.and_(x, y))
+
+
+@intrinsic
+def bit_or(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return a | b, lane by lane."""
+    return _two(a, b, lambda builder, x, y: builder.or_(x, y))
 
 
 @intrinsic
@@ -208,18 +248,6 @@ def shifted(typingctx, before, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def evens(typingctx, a, b):  # type: ignore[no-untyped-def]
-    """Return lanes 0, 2, 4, ... of ``a``, then those of ``b``."""
-    return _every_second(a, b, 0)
-
-
-@intrinsic
-def odds(typingctx, a, b):  # type: ignore[no-untyped-def]
-    """Return lanes 1, 3, 5, ... of ``a``, then those of ``b``."""
-    return _every_second(a, b, 1)
-
-
-@intrinsic
 def smaller(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return the smaller of a and b as signed numbers, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.select(builder.icmp_signed("<", x, y), x, y))
@@ -272,12 +300,13 @@ def bit_counts(typingctx, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def widen(typingctx, a, like):  # type: ignore[no-untyped-def]
-    """Return unsigned ``a`` as lanes of the type of ``like``, which is as wide or wider."""
+def resized(typingctx, a, like):  # type: ignore[no-untyped-def]
+    """Return unsigned ``a`` as lanes of the type of ``like``, which is wide enough for it."""
 
     def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         x, y = arguments
-        return x if x.type == y.type else builder.zext(x, y.type)
+        old, new = x.type.element.width, y.type.element.width
+        return x if old == new else (builder.zext if old < new else builder.trunc)(x, y.type)
 
     return like(a, like), emit
 
@@ -396,11 +425,6 @@ def _two(a: Any, b: Any, on_integers: Any, on_reals: Any = None) -> Any:
         return instruction(builder, *arguments)
 
     return (a(a, b), emit) if a == b else None
-
-
-def _every_second(a: Any, b: Any, first: int) -> Any:
-    places = list(range(first, 2 * LANES, 2))
-    return _two(a, b, lambda builder, x, y: builder.shuffle_vector(x, y, ir.Constant(_vector(32), places)))
 
 
 def _vector(bits: int) -> Any:

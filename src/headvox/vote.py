@@ -21,6 +21,7 @@ from headvox.integral import Integral, box_reach, place, set_corners, with_margi
 from headvox.kernels import bare_kernel, kernel, product, rule
 from headvox.masks import STATISTICS
 from headvox.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
+from headvox.slabs import ONE_SLAB, slice_of
 
 DROPPED = -(1 << 40)
 FEATURES_PER_GROUP = len(STATISTICS)
@@ -32,11 +33,10 @@ F64 = npt.NDArray[np.float64]
 
 @rule
 def sum_in_halves(S, x, y, z, box):  # type: ignore[no-untyped-def]
-    """Return the exact sum over ``box`` about the voxel x, y, z as a signed number; S is in halves."""
-    nx, ny, nz, half = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1, S.shape[2] // 2
-    x0, x1 = min(max(x + box[0], 0), nx), min(max(x + box[1], 0), nx)
-    y0, y1 = min(max(y + box[2], 0), ny), min(max(y + box[3], 0), ny)
-    z0, z1 = place(min(max(z + box[4], 0), nz), half), place(min(max(z + box[5], 0), nz), half)
+    """Return the exact sum over ``box`` about the voxel x, y, z as a signed number; S, which holds it, is in halves."""
+    half = S.shape[2] // 2
+    x0, x1, y0, y1 = x + box[0], x + box[1], y + box[2], y + box[3]
+    z0, z1 = place(z + box[4], half), place(z + box[5], half)
     high = S[x1, y1, z1] - S[x0, y1, z1] - S[x1, y0, z1] + S[x0, y0, z1]
     low = S[x1, y1, z0] - S[x0, y1, z0] - S[x1, y0, z0] + S[x0, y0, z0]
     mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
@@ -78,10 +78,15 @@ def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes): 
 
 
 @kernel
-def vote_masks(S, cells, first, last, boxes, weights, start, masks, pairs, cost, min_votes, scores, best_yaw):  # type: ignore[no-untyped-def]
-    """Score the candidates ``first`` to ``last`` of ``cells``: see :func:`score_by_votes`."""
+def vote_masks(  # type: ignore[no-untyped-def]
+    S, seams, overlap, cells, first, last, boxes, weights, start, masks, pairs, cost, min_votes, scores, best_yaw,
+):  # fmt: skip
+    """Score the candidates ``first`` to ``last`` of ``cells``: see :func:`score_by_votes`.
+
+    S is in halves and in slabs (:mod:`headvox.slabs`).
+    """
     for i in range(first, last):
-        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        x, y, z = slice_of(cells[i, 0], seams, overlap), cells[i, 1], cells[i, 2]
         scores[i], yaw = votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes)
         if yaw >= 0:
             best_yaw[i] = yaw
@@ -106,7 +111,7 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
     )
     reach = box_reach(np.concatenate([votes.boxes, votes.pairs.reshape(-1, 6)]))
     S, cells = with_margins(S, reach), cells - reach[0::2].astype(np.int32)
-    vote_masks(S, cells, 0, len(cells), *table, scores, best_yaw)
+    vote_masks(S, *ONE_SLAB, cells, 0, len(cells), *table, scores, best_yaw)
     return scores, best_yaw
 
 
@@ -193,7 +198,7 @@ def _look_up(flat, at, is_odd, width, corners, first, count, sums):  # type: ign
 
 @bare_kernel
 def vote_stages(  # type: ignore[no-untyped-def]
-    S, cells, seen, first, last, to_stage, group_start, group_channel, seen_start, used_start, used,
+    S, seams, overlap, cells, seen, first, last, to_stage, group_start, group_channel, seen_start, used_start, used,
     leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, is_odd, sums, features,
     values, total, scores,
 ):  # fmt: skip
@@ -201,11 +206,11 @@ def vote_stages(  # type: ignore[no-untyped-def]
 
     Each stage takes the candidates that are left, LANES at a time: it looks up the groups its trees ask for, and adds
     its trees up. ``seen`` (candidates, boxes of other channels, 2) holds how many cells of a box are known-empty and
-    hidden. No box may leave S, which is in halves; ``corners`` are those of the boxes. ``alive`` (candidates,), ``at``
-    and ``is_odd`` (LANES,) and the rows of LANES numbers ``sums``, ``features``, ``values`` and ``total`` are working
-    memory.
+    hidden. S is in halves and in slabs (:mod:`headvox.slabs`), which no box may leave; ``corners`` are those of the
+    boxes. ``alive`` (candidates,), ``at`` and ``is_odd`` (LANES,) and the rows of LANES numbers ``sums``, ``features``,
+    ``values`` and ``total`` are working memory.
     """
-    flat, end = S.reshape(-1), last
+    flat, end, slices = S.reshape(-1), last, overlap * S.shape[1] * S.shape[2]
     for i in range(first, last):
         scores[i] = 0
         alive[i] = i
@@ -217,6 +222,9 @@ def vote_stages(  # type: ignore[no-untyped-def]
                 i = alive[begin + lane]
                 column = (cells[i, 0] * S.shape[1] + cells[i, 1]) * S.shape[2]
                 at[lane], is_odd[lane] = column + (cells[i, 2] >> 1), -(cells[i, 2] & 1)
+            for seam in range(seams.shape[0]):  # as headvox.slabs.slice_of, of the whole vector
+                for lane in range(width):
+                    at[lane] += slices * (cells[alive[begin + lane], 0] >= seams[seam])
             for u in range(used_start[s], used_start[s + 1]):
                 g, ranked = used[u, 0], used[u, 1]
                 count, channel = group_start[g + 1] - group_start[g], group_channel[g]
@@ -335,7 +343,6 @@ def score_by_stages(S: Integral, cells: I32, stages: CompiledStages, seen: I32 |
     corners = np.empty((len(stages.boxes), 8), np.int64)
     set_corners(S, stages.boxes, corners)
     scores, alive = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
-    vote_stages(
-        S, cells, seen, 0, len(cells), to_stage, *tables.tables, corners, alive, *tables.memory(), scores
-    )
+    settings = (seen, 0, len(cells), to_stage, *tables.tables, corners, alive, *tables.memory())
+    vote_stages(S, *ONE_SLAB, cells, *settings, scores)
     return scores

@@ -2,7 +2,8 @@
 
 A voxel of a *parts* grid is one byte with a bit for each of its 2x2x2 parts (or one bit for the voxel itself, with a
 subdivision of 1): a bit says "some point fell in here". A voxel of a *count* grid is the number of its points. Both
-are integers that do not depend on the order of the points, so any number of threads gives the same grid.
+are integers that do not depend on the order of the points. Each of several threads has a grid of its own: a bit of any
+of them, or their numbers added up, are the frame's, which so are the same for any number of threads.
 
 Cells are half-open: a point on the border of two cells belongs to the upper one. Coordinates are float32; a cell is
 ``floor((world - origin) / cell edge)``, the sum taken as written in the kernels.
@@ -318,18 +319,6 @@ def mark_depth(  # type: ignore[no-untyped-def]
 def empty(cells):  # type: ignore[no-untyped-def]
     """Clear a flat grid."""
     cells[:] = 0
-
-
-@bare_kernel
-def merge(cells, other, counting):  # type: ignore[no-untyped-def]
-    """Add what another thread entered into the flat grid ``other``, and clear it there."""
-    if counting:
-        for i in range(cells.shape[0]):
-            cells[i] += other[i]
-    else:
-        for i in range(cells.shape[0]):
-            cells[i] |= other[i]
-    other[:] = 0
 
 
 @dataclass(frozen=True, slots=True)

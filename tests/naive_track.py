@@ -6,7 +6,7 @@ import naive_kalman as kalman
 import numpy as np
 
 from headvox import identity, noise
-from headvox.lifetime import MOST_DRAIN
+from headvox.lifetime import MOST_DRAIN, WEAK
 from headvox.visibility import BEHIND, OUT_OF_VIEW
 
 
@@ -53,13 +53,13 @@ def scatter_of(stamps_ns, centres):
     return scatter
 
 
-def age(life, trust, seen, sure, state, dt, lasts_s, missed_s, weak_s):
+def age(life, trust, strength, seen, sure, state, dt, lasts_s, present_s, weak_s):
     """Return life and trust of one living track after a frame."""
     if seen and sure:
-        return 1.0, min(trust + dt / missed_s, 1.0)
+        return 1.0, min(trust + strength * dt / present_s, 1.0)
     if seen:
-        life_s = trust_s = weak_s
+        life_s, trust_s = weak_s, WEAK * present_s
     else:
         life_s = lasts_s[state]
-        trust_s = np.inf if state in (OUT_OF_VIEW, BEHIND) else missed_s
+        trust_s = np.inf if state in (OUT_OF_VIEW, BEHIND) else present_s
     return life - min(dt / life_s, MOST_DRAIN), trust - min(dt / trust_s, MOST_DRAIN)

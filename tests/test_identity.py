@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from headvox import identity, noise
-from headvox.lifetime import KNOWN_M, age, judge_new, missing, turn_page
+from headvox.lifetime import ELSEWHERE, age, judge_new, missing, turn_page
 from headvox.roster import blank
-from headvox.visibility import SEEN_EMPTY
 
 NOW_NS, BEFORE_NS = 10_000_000_000, 9_900_000_000
 
@@ -59,9 +58,11 @@ def test_pairs_are_the_likeliest_as_a_whole():
 def test_a_sighting_is_entered():
     roster = some_tracks(np.random.default_rng(3))
     roster["sightings"][4], roster["height"][4], roster["hits"][4] = 3, 1.6, 2
-    centres, sure = np.array([[9.0, 9, 9], [1.0, 2.0, 1.7]]), np.array([True, True])
-    radii, scores = np.array([0.1, 0.11]), np.array([1.0, 2.0])
-    identity.note_sightings(roster, np.array([4]), np.array([1]), NOW_NS, centres, radii, scores, sure)
+    centres = np.array([[9.0, 9, 9], [1.0, 2.0, 1.7]])
+    roster["strength"][4] = 0.9
+    heads = centres, np.array([0.1, 0.11]), np.array([1.0, 2.0]), np.array([True, True])
+    identity.note_sightings(roster, np.array([4]), np.array([1]), NOW_NS, *heads, 4.0)
+    assert roster["strength"][4] == pytest.approx(0.9 + (2.0 / 4.0 - 0.9) / 4)
     mean = roster["weights"][4] @ roster["x"][4]
     np.testing.assert_allclose(roster["place"][4], mean[:3])
     np.testing.assert_allclose(roster["velocity"][4], mean[3:])
@@ -118,37 +119,52 @@ def test_the_scatter_is_that_of_the_noise_and_not_of_the_way():
 
 def test_ages_equal_the_plain_ones():
     rng = np.random.default_rng(9)
-    lasts_s = np.array([0.5, np.inf, 3.0, np.inf, 0.3])
+    lasts_s = np.array([0.5, 1.0, 3.0, np.inf, 0.3, np.inf])
     roster = some_tracks(rng, 200)
     roster["life"][:], roster["trust"][:] = rng.uniform(0.1, 1.0, (2, 200))
+    roster["strength"][:] = rng.uniform(0.2, 1.0, 200)
     roster["seen_ns"][::2] = NOW_NS
     roster["hits"][:] = rng.integers(0, 4, 200)
-    states = rng.integers(0, SEEN_EMPTY + 1, 200)
+    states = rng.integers(0, ELSEWHERE + 1, 200)
     before = roster.copy()
-    age(roster, NOW_NS, 0.1, states, lasts_s, 1.0, 2.0)
+    age(roster, NOW_NS, 0.1, states, lasts_s, 3.0, 2.0)
     for n in range(200):
         if before["lost"][n]:
             expected, lost = (before["life"][n], before["trust"][n]), True
         else:
             seen, sure = before["seen_ns"][n] == NOW_NS, before["hits"][n] & 1
-            expected = naive.age(
-                before["life"][n], before["trust"][n], seen, sure, states[n], 0.1, lasts_s, 1.0, 2.0
-            )
+            row = before["life"][n], before["trust"][n], before["strength"][n]
+            expected = naive.age(*row, seen, sure, states[n], 0.1, lasts_s, 3.0, 2.0)
+            assert roster["absent"][n] == (not seen and states[n] == ELSEWHERE)
             lost = min(expected) <= 0.0
         assert (roster["life"][n], roster["trust"][n]) == pytest.approx(expected)
         assert roster["lost"][n] == lost
     assert before["lost"].sum() < roster["lost"].sum() < 200
 
 
-def test_new_tracks_are_judged_by_their_hits():
-    roster = blank(5)
-    roster["id"][:] = 0, 0, 0, 0, 7
-    roster["hits"][:] = 0b10101, 0b11, 0, 0b111, 0
-    roster["lost"][:] = False, False, False, True, True
-    ready, kept = np.empty((2, 5), np.bool_)
-    assert judge_new(roster, 3, ready, kept) == (True, False)
-    assert ready.tolist() == [True, False, False, False, False]
-    assert kept.tolist() == [True, True, False, False, True]
+def test_new_tracks_are_judged_by_their_hits_and_how_these_score():
+    """Against two: hits by their strength, less half a hit for every miss since the first; or each of five frames."""
+    judged = [
+        # hits, strength, id, lost, ready, kept
+        (0b11, 1.0, 0, False, True, True),
+        (0b101, 1.0, 0, False, False, True),
+        (0b101, 1.3, 0, False, True, True),
+        (0b10101, 1.0, 0, False, True, True),
+        (0b10001, 1.5, 0, False, False, True),
+        (0b111, 0.6, 0, False, False, True),
+        (0b11111, 0.3, 0, False, True, True),
+        (0b11110, 0.3, 0, False, False, True),
+        (0b111, 1.0, 0, True, False, False),
+        (0, 1.0, 0, False, False, False),
+        (0, 1.0, 7, True, False, True),
+    ]
+    roster = blank(len(judged))
+    for name, column in zip(("hits", "strength", "id", "lost"), zip(*judged, strict=True), strict=False):
+        roster[name] = column
+    ready, kept = np.empty((2, len(judged)), np.bool_)
+    assert judge_new(roster, 2, 5, ready, kept) == (True, False)
+    assert ready.tolist() == [row[4] for row in judged]
+    assert kept.tolist() == [row[5] for row in judged]
 
 
 def test_a_page_is_turned():
@@ -165,12 +181,11 @@ def test_a_page_is_turned():
 def test_the_missing_are_where_they_are_expected():
     roster = some_tracks(np.random.default_rng(11), 60)
     roster["seen_ns"][::3] = NOW_NS
-    rows, places, known = np.empty(60, np.int64), np.empty((60, 3)), np.empty(60, np.bool_)
-    count = missing(roster, NOW_NS, rows, places, known)
+    rows, places, widths = np.empty(60, np.int64), np.empty((60, 3)), np.empty(60)
+    count = missing(roster, NOW_NS, rows, places, widths)
     expected = [n for n in range(60) if n % 3 and not roster["lost"][n]]
     assert rows[:count].tolist() == expected
     for k, n in enumerate(expected):
         mean, cov = kalman.mixture(roster["weights"][n], roster["x"][n], roster["P"][n])
         np.testing.assert_allclose(places[k], mean[:3])
-        assert known[k] == (np.sqrt(np.trace(cov[:3, :3])) <= KNOWN_M)
-    assert 0 < known[:count].sum() < count
+        assert widths[k] == pytest.approx(np.sqrt(np.trace(cov[:3, :3])))

@@ -27,6 +27,7 @@ def some_tracks(rng, count):
     roster["radius"], roster["score"] = rng.normal(size=(2, count))
     roster["id"] = rng.permutation(np.maximum(np.arange(count) - count // 3, 0))
     roster["lost"] = rng.random(count) < 0.3
+    roster["absent"] = rng.random(count) < 0.2
     roster["born_ns"] = LAST_NS - 3_000_000_000
     roster["seen_ns"] = LAST_NS - rng.integers(0, 2, count) * 400_000_000
     return roster
@@ -37,8 +38,9 @@ def test_tracks_are_told_as_they_stand_in_the_table(count):
     roster = some_tracks(np.random.default_rng(count), count)
     tracks = report(roster, LAST_NS, STAMP_NS)
     living = [n for n in range(count) if not roster["lost"][n]]
-    named = sorted((n for n in living if roster["id"][n]), key=lambda n: roster["id"][n])
-    nameless = [n for n in living if not roster["id"][n] and roster["seen_ns"][n] == LAST_NS]
+    there = [n for n in living if not roster["absent"][n]]
+    named = sorted((n for n in there if roster["id"][n]), key=lambda n: roster["id"][n])
+    nameless = [n for n in there if not roster["id"][n] and roster["seen_ns"][n] == LAST_NS]
     rows = roster[named + nameless]
     np.testing.assert_array_equal(tracks.ids, rows["id"])
     for k, row in enumerate(rows):

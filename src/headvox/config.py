@@ -77,10 +77,12 @@ class DetectorConfig:
 class TrackerConfig:
     """Everything a :class:`~headvox.track.Tracker` can be told."""
 
-    confirm_hits: int = 3
-    """A new head gets an id when it was seen in so many ..."""
+    confirm_hits: int = 2
+    """A new head gets an id when it was seen in so many (more, where it scores less than ``strong_score``) ..."""
     confirm_frames: int = 5
-    """... of so many frames in a row."""
+    """... of so many frames in a row, or in each of these."""
+    strong_score: float = 4.0
+    """What true heads mostly score; what scores less counts for less."""
     gate_sigmas: float = 4.0
     """A detection farther than this from where a track should be, in standard deviations, is not its head."""
     speed_change_m_s: float = 1.0
@@ -92,7 +94,9 @@ class TrackerConfig:
     out_of_view_s: float = 0.5
     """... or is out of every sensor's view for so long ..."""
     missed_s: float = 1.0
-    """... or is in view, but nothing is found there (one just begun, or seen in few frames, ends sooner) ..."""
+    """... or gives no return to a sensor, or is in a cloud, and nothing is found there ..."""
+    present_s: float = 2.8
+    """... or something is there, but no head (less if it was seen in few frames, or scores little) ..."""
     weak_s: float = 2.0
     """... or only what scores too little to be a head by itself ..."""
     hidden_s: float = 3.0

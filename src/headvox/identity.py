@@ -25,6 +25,7 @@ SAME_HEAD_M = 0.18  # two heads are not closer: what is found so near to a head 
 HEIGHT_M = 0.03  # standard deviation of the height of a head about its mean: gait, noise
 BENT = 0.02  # share of those who bent down, or stretched: any height within a metre is as good
 MOST_SIGHTINGS = 30  # that a mean height is taken over
+MOST_STRENGTH = 1.5  # of a sighting: one alone makes no track, however it scores
 BACK_M, BACK_M_S, BACK_FARTHEST_M = 0.4, 1.0, 2.0  # a lost head is found no farther than this from its way
 BACK_SIGMAS = 3.0  # nor farther than this from its height
 VIEW_M = 0.015  # how much a mean height depends on the side that a head is seen from
@@ -71,8 +72,11 @@ def price(roster, centres, R, sure, gate, now_ns, costs):  # type: ignore[no-unt
 
 
 @kernel
-def note_sightings(roster, tracks, found, now_ns, centres, radii, scores, sure):  # type: ignore[no-untyped-def]
-    """Enter for the ``tracks`` (K,) which of the heads were ``found`` (K,); their filters are corrected already."""
+def note_sightings(roster, tracks, found, now_ns, centres, radii, scores, sure, strong):  # type: ignore[no-untyped-def]
+    """Enter for the ``tracks`` (K,) which of the heads were ``found`` (K,); their filters are corrected already.
+
+    A sighting that scores ``strong`` counts for one, and none for more than ``MOST_STRENGTH``.
+    """
     for k in range(tracks.shape[0]):
         row, m = roster[tracks[k]], found[k]
         row.seen_ns = now_ns
@@ -85,6 +89,7 @@ def note_sightings(roster, tracks, found, now_ns, centres, radii, scores, sure):
                 row.velocity[a] += row.weights[i] * row.x[i, 3 + a]
         row.sightings = min(row.sightings + 1, MOST_SIGHTINGS)
         row.height += (centres[m, 2] - row.height) / row.sightings
+        row.strength += (min(scores[m] / strong, MOST_STRENGTH) - row.strength) / row.sightings
 
 
 def pairs(costs: F64) -> tuple[I64, I64]:

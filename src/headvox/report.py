@@ -17,7 +17,9 @@ EXPECTED_DIGITS = (
 
 
 def report(roster: Roster, last_ns: int, stamp_ns: int) -> Tracks:
-    """Return the living as tracks, those with an id first; a tentative one only where it was seen at ``last_ns``.
+    """Return the living as tracks, those with an id first.
+
+    One that is absent is not stated, and a tentative one only where it was seen at ``last_ns``.
 
     ``last_ns`` is the stamp of the last frame, ``stamp_ns`` the moment to which ``roster`` was predicted.
     """
@@ -67,10 +69,11 @@ def stated(roster, last_ns, order):  # type: ignore[no-untyped-def]
     """Write to ``order`` (N,) which rows are stated: by id, then those without one. Return how many."""
     count = 0
     for n in range(roster.shape[0]):
-        if roster[n].lost or (roster[n].id == 0 and roster[n].seen_ns != last_ns):
+        row = roster[n]
+        if row.lost or row.absent or (row.id == 0 and row.seen_ns != last_ns):
             continue
         at = count
-        while at > 0 and roster[n].id > 0 and not 0 < roster[order[at - 1]].id < roster[n].id:
+        while at > 0 and row.id > 0 and not 0 < roster[order[at - 1]].id < row.id:
             order[at] = order[at - 1]
             at -= 1
         order[at] = n

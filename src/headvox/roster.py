@@ -16,12 +16,14 @@ ROW = np.dtype(
         ("life", np.float64),
         ("trust", np.float64),
         ("lost", np.bool_),
+        ("absent", np.bool_),
         ("place", np.float64, 3),
         ("velocity", np.float64, 3),
         ("height", np.float64),
         ("sightings", np.int64),
         ("radius", np.float64),
         ("score", np.float64),
+        ("strength", np.float64),
         ("last", np.float64, (2, 3)),
         ("last_ns", np.int64, 2),
         ("scatter", np.float64, (3, 3)),
@@ -39,10 +41,10 @@ ROW = np.dtype(
 
 ``id``, 0 until confirmed; ``born_ns`` and ``seen_ns``, first and last seen; ``hits``, a bit a frame, the last frame
 lowest; ``life``, 1 when seen, dead at 0; ``trust``, grows while it is seen, shrinks while its place is in plain view
-without it, dead at 0; ``lost``, dead, but remembered.
+without it, dead at 0; ``lost``, dead, but remembered; ``absent``, not where it is expected: seen to be empty.
 
 ``place`` and ``velocity``, where it was last seen, and how fast; ``height``, its usual height [m], over so many
-``sightings``; ``radius`` and ``score`` of the last sighting.
+``sightings``; ``radius`` and ``score`` of the last sighting; ``strength``, how well its sightings score.
 
 ``last`` and ``last_ns`` are the last two measured centres, the newest first; ``scatter`` is the covariance by which
 they scatter from frame to frame [m²].

@@ -15,7 +15,7 @@ import numpy as np
 from headvox.config import TrackerConfig
 from headvox.data import F64, I64, Cloud, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
-from headvox.identity import come_back, note_sightings, pairs, price
+from headvox.identity import MOST_STRENGTH, come_back, note_sightings, pairs, price
 from headvox.kalman import (
     FIRST_RATE_RAD_S,
     MOVING,
@@ -26,7 +26,7 @@ from headvox.kalman import (
     predict_places,
     predict_turns,
 )
-from headvox.lifetime import age, judge_new, missing, turn_page
+from headvox.lifetime import ELSEWHERE, KNOWN_M, VAGUE_M, age, judge_new, missing, turn_page
 from headvox.noise import measurement_noise, widen
 from headvox.report import expectations, report, tentative
 from headvox.roster import ROW, Roster, blank
@@ -38,7 +38,7 @@ UPRIGHT = np.array([1.0, 1.0, 0.4])  # heads move along the floor more than up a
 FADE_S = np.array([2.0, 2.0, 0.3])  # how long a head that is not seen goes on: up and down not for long
 WANDER_M2_S = 1e-6  # a head at rest sways by a millimetre in a second
 TURN_GATE = 16.3  # squared Mahalanobis distance: one in a thousand is farther
-FIRST_TRUST = 0.3
+FIRST_TRUST = 0.15
 
 
 class Tracker:
@@ -148,27 +148,41 @@ class Tracker:
         widen(roster, tracks, found, now_ns, heads.centres, R_centre)
         correct_places(roster, tracks, found, heads.centres, R_centre)
         correct_turns(roster, tracks, found, heads.quaternions, R_turn, TURN_GATE)
-        note_sightings(roster, tracks, found, now_ns, heads.centres, heads.radii, heads.scores, heads.sure)
+        note_sightings(
+            roster,
+            tracks,
+            found,
+            now_ns,
+            heads.centres,
+            heads.radii,
+            heads.scores,
+            heads.sure,
+            self.config.strong_score,
+        )
 
     def _age(self, frame: Frame, dt: float) -> None:
         """Let the tracks that were not surely seen lose life, by what the sensors saw of their places; end the dead."""
         config, roster = self.config, self._roster
         n = len(roster)
         states = np.full(n, OUT_OF_VIEW)
-        rows, places, known = np.empty(n, np.int64), np.empty((n, 3)), np.empty(n, np.bool_)
-        count = missing(roster, self._now(), rows, places, known)
+        rows, places, widths = np.empty(n, np.int64), np.empty((n, 3)), np.empty(n)
+        count = missing(roster, self._now(), rows, places, widths)
         if count:
             seen = look_for(frame, places[:count], config.sight_m)
-            seen[(seen == SEEN_EMPTY) & ~known[:count]] = SURFACE
+            least_m = np.where(seen == SEEN_EMPTY, KNOWN_M, VAGUE_M)
+            plain = (seen == SEEN_EMPTY) | (seen == SURFACE)
+            seen[plain & (widths[:count] > least_m)] = ELSEWHERE
             states[rows[:count]] = seen
-        age(roster, self._now(), dt, states, self._lasts_s, config.missed_s, config.weak_s)
+        age(roster, self._now(), dt, states, self._lasts_s, config.present_s, config.weak_s)
         self._confirm()
 
     def _confirm(self) -> None:
         """Give an id to what was seen often enough, its old one if it was known; let go of what no longer can be."""
         roster = self._roster
         ready, kept = np.empty((2, len(roster)), np.bool_)
-        any_ready, all_kept = judge_new(roster, self.config.confirm_hits, ready, kept)
+        any_ready, all_kept = judge_new(
+            roster, self.config.confirm_hits, self.config.confirm_frames, ready, kept
+        )
         if any_ready:
             new = np.flatnonzero(ready)
             back, known = come_back(roster, new, np.flatnonzero(roster["id"] > 0))
@@ -191,6 +205,7 @@ class Tracker:
         born["last"][:, 0], born["last_ns"][:, 0] = centres, self._now()
         born["place"], born["height"] = centres, centres[:, 2]
         born["radius"], born["score"] = heads.radii[new], heads.scores[new]
+        born["strength"] = np.minimum(heads.scores[new] / self.config.strong_score, MOST_STRENGTH)
         born["x"][:, :, :3] = centres[:, None]
         born["P"][:, :, :3, :3] = R_centre[new, None]
         born["P"][:, MOVING, 3:, 3:] = np.diag(FIRST_SPEED_M_S**2)
@@ -224,15 +239,17 @@ class Tracker:
 
 
 def _lasts_s(config: TrackerConfig) -> F64:
-    """Return how long a track lives (5,) for each thing that may be seen of its place."""
-    lasts_s = np.full(5, np.inf)
-    lasts_s[[OUT_OF_VIEW, BEHIND, SEEN_EMPTY]] = config.out_of_view_s, config.hidden_s, config.empty_s
+    """Return how long a track lives (6,) for each thing that may be seen of its place."""
+    lasts_s = np.full(ELSEWHERE + 1, np.inf)
+    lasts_s[OUT_OF_VIEW], lasts_s[NO_RETURN] = config.out_of_view_s, config.missed_s
+    lasts_s[BEHIND], lasts_s[SEEN_EMPTY] = config.hidden_s, config.empty_s
     return lasts_s
 
 
 def _longest_s(config: TrackerConfig) -> float:
     """Return how long any track may be unseen and still be something."""
-    return max(config.remember_s, config.hidden_s, config.missed_s, config.out_of_view_s, config.empty_s)
+    limits_s = config.hidden_s, config.present_s, config.missed_s, config.out_of_view_s, config.empty_s
+    return max(config.remember_s, *limits_s)
 
 
 def look_for(frame: Frame, places: F64, sight_m: float) -> I64:

@@ -1,10 +1,11 @@
 """How well does the pose fit do on people that nobody has learnt from?
 
-    python bench/refine.py [--views 40] [--turns 1] [--workers 1]
+    python bench/refine.py [--views 40] [--turns 1] [--workers 1] [--seed N]
 
 Each start is 3 to 5 cm off and no yaw is known. Prints a markdown table: centre (mm) and angle (degrees) as median /
-p90, yaw more than 30 degrees off (gross), how many orientations are stated at all, how many yaws are stated to 15
-degrees, and how many of those are within 30. Angles and gross are those of the orientations that are stated. Hats, and
+p90, yaw more than 30 degrees off (gross) of the orientations that are stated, and of those of all heads, how many are
+stated at all, how many yaws are stated to 15 degrees, and how many of those are within 30. The angles are those of the
+orientations that are stated. Hats, and
 heads of which less than 70 % sends something back (dark hair), have rows of their own. Then bald shells in any
 rotation, and what a fit takes: processor time of one core.
 """
@@ -18,6 +19,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from headvox.align import EVIDENCE
 from headvox.data import Cloud, Expected, Frame
 from headvox.errors import HeadvoxError
 from headvox.pose import FitMemory, fit_poses
@@ -25,9 +27,12 @@ from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
 from headvox.threads import Threads
+from headvox.trials import TRIED, Trials
 from headvox.workers import Workers
 
-EVALUATION = 0xE7A1
+EVALUATION = (
+    0x6A5E  # people of no other seed were fitted to; those of 0xE7A1 were measured by earlier versions
+)
 KINDS = {
     "face, 1 m": (1.0, 0, 1), "face, 1.5 m": (1.5, 0, 1), "face, 2 m": (2.0, 0, 1), "face, 3 m": (3.0, 0, 1),
     "profile, 1 m": (1.0, 90, 1), "profile, 1.5 m": (1.5, 90, 1), "profile, 2 m": (2.0, 90, 1),
@@ -39,15 +44,15 @@ SPREAD_DEG = 25.0
 SHELL_POINTS = 9000
 
 
-def one_view(job: tuple[str, int]) -> dict[str, object] | None:
+def one_view(job: tuple[int, str, int]) -> dict[str, object] | None:
     """Fit one view; None where no room had space for it."""
-    kind, number = job
+    root, kind, number = job
     distance, bearing, cameras = KINDS[kind]
-    rng = np.random.default_rng([EVALUATION, list(KINDS).index(kind), number])
+    rng = np.random.default_rng([root, list(KINDS).index(kind), number])
     spread = SPREAD_DEG if cameras == 1 else 180.0
     side = rng.choice([-1.0, 1.0])
     try:
-        seed = (EVALUATION, 1, list(KINDS).index(kind), number)
+        seed = (root, 1, list(KINDS).index(kind), number)
         view = portrait(
             seed, distance, float(np.radians(side * bearing + rng.uniform(-spread, spread))), cameras
         )
@@ -61,10 +66,10 @@ def one_view(job: tuple[str, int]) -> dict[str, object] | None:
     return {**result, "kind": kind, "hard": hard}
 
 
-def one_shell(number: int, turns: int) -> list[dict[str, object]]:
+def one_shell(number: int, root: int, turns: int) -> list[dict[str, object]]:
     """Fit one bald shell in ``turns`` random rotations."""
-    shell = make_shell(sample_identities(44, EVALUATION)[number], False)
-    rng = np.random.default_rng([EVALUATION, 2, number])
+    shell = make_shell(sample_identities(44, root)[number], False)
+    rng = np.random.default_rng([root, 2, number])
     points = spread_points(shell.vertices, shell.faces, SHELL_POINTS, rng) @ HEADVOX_TO_PAPER
     found = []
     for _ in range(turns):
@@ -84,6 +89,7 @@ def measure(frame: Frame, centre: np.ndarray, R: Rotation, rng: np.random.Genera
     began = time.thread_time()
     poses = fit_poses(frame, start, memory, threads)
     took = time.thread_time() - began
+    guessed = best_yaw(memory.trials, R)
     turned = R * Rotation.from_rotvec(np.radians(rng.normal(0.0, 7.0, 3)))
     expected = Expected(start, turned.as_quat()[None], np.array([0.1]))
     fit_poses(frame, start, memory, threads, expected)
@@ -93,17 +99,32 @@ def measure(frame: Frame, centre: np.ndarray, R: Rotation, rng: np.random.Genera
         "centre": 1e3 * np.linalg.norm(poses.centres[0] - centre),
         "shift": 1e3 * R.inv().apply(poses.centres[0] - centre),
         "ms": 1e3 * took,
+        "guessed": guessed,
         "tracked ms": 1e3 * (time.thread_time() - began),
         "tracked centre": 1e3 * np.linalg.norm(tracked.centres[0] - centre),
     }
     for name, fit in (("", poses), ("tracked ", tracked)):
         if np.isfinite(fit.quaternions).all():
             turn = R.inv() * Rotation.from_quat(fit.quaternions[0])
-            x, y, _ = turn.as_matrix()[:, 0]
             result[name + "angle"] = np.degrees(turn.magnitude())
-            result[name + "yaw"] = abs(np.degrees(np.arctan2(y, x)))
+            result[name + "yaw"] = yaw_of(turn)
             result[name + "sigma"] = np.degrees(np.sqrt(fit.rotation_covariances[0, 2, 2]))
     return result
+
+
+def best_yaw(trials: Trials, R: Rotation) -> float:
+    """Return how far the yaw of the best state of the last fit is off, stated or not, degrees."""
+    tried = trials.counts[0, TRIED]
+    if not tried:
+        return 180.0
+    best = trials.states[0, np.argmin(trials.told[0, :tried, EVIDENCE])]
+    return yaw_of(R.inv() * Rotation.from_matrix(best[3:12].reshape(3, 3)))
+
+
+def yaw_of(turn: Rotation) -> float:
+    """Return how far the face is turned to a side, degrees."""
+    x, y, _ = turn.as_matrix()[:, 0]
+    return float(abs(np.degrees(np.arctan2(y, x))))
 
 
 def row(name: str, results: list[dict[str, object]]) -> str:
@@ -111,7 +132,8 @@ def row(name: str, results: list[dict[str, object]]) -> str:
     told = [result for result in results if "angle" in result]
     sure = [result for result in told if result["sigma"] <= 15.0]
     cells = [name, str(len(results)), spread(results, "centre"), spread(told, "angle")]
-    cells += [share(told, lambda r: r["yaw"] > 30.0), f"{len(told) / max(len(results), 1):.0%}"]
+    cells += [share(told, lambda r: r["yaw"] > 30.0), share(results, lambda r: r["guessed"] > 30.0)]
+    cells += [f"{len(told) / max(len(results), 1):.0%}"]
     cells += [f"{len(sure) / max(len(results), 1):.0%}", share(sure, lambda r: r["yaw"] <= 30.0)]
     return "| " + " | ".join(cells) + " |"
 
@@ -132,12 +154,13 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=40, help="of each kind")
     parser.add_argument("--turns", type=int, default=1, help="of each of 44 shells; 0 leaves them out")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=EVALUATION, help="of the people and the rooms")
     args = parser.parse_args()
-    jobs = [(kind, number) for number in range(args.views) for kind in KINDS]
+    jobs = [(args.seed, kind, number) for number in range(args.views) for kind in KINDS]
     results = [r for r in Workers(args.workers).map(one_view, jobs) if r is not None]
     usual = [r for r in results if r["hard"] is None]
-    print("| view | heads | centre mm | angle deg | gross | stated | to 15 deg | of these right |")
-    print("| --- " * 8 + "|")
+    print("| view | heads | centre mm | angle deg | gross | of all | stated | to 15 deg | of these right |")
+    print("| --- " * 9 + "|")
     for kind in KINDS:
         print(row(kind, [r for r in usual if r["kind"] == kind]))
     for hard in ("hats", "drop-outs"):
@@ -151,7 +174,9 @@ def main() -> None:
     if args.turns:
         shells = [
             r
-            for some in Workers(args.workers).map(partial(one_shell, turns=args.turns), range(44))
+            for some in Workers(args.workers).map(
+                partial(one_shell, root=args.seed, turns=args.turns), range(44)
+            )
             for r in some
         ]
         print("\n" + row(f"{len(shells)} shells, any rotation", shells), f"{spread(shells, 'ms')} ms")

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from headvox import align, nearby, trials
 from headvox import settle as settling
+from headvox import template as template_of
 from headvox.data import Frame
 
 
@@ -132,9 +133,9 @@ def move(state, step):
     return new
 
 
-def align_one(samples, rays, turn, upright, template):
-    """What a single start comes to: state, told, covariance of shift and turn."""
-    modes = align.MODES
+def refine_one(samples, rays, turn, upright, template):
+    """What a single start comes to: state, told."""
+    modes = template_of.FINE_MODES
     state = np.zeros(align.STATE)
     state[3:12] = turn
     most = (trials.FINE_SAMPLES, trials.FINE_RAYS)
@@ -142,7 +143,17 @@ def align_one(samples, rays, turn, upright, template):
         _, A, b, _ = linearise(samples, rays, most, modes, k, upright, template, state)
         state = move(state, -np.linalg.solve(A, b))
     cost, A, _, told = linearise(samples, rays, most, modes, trials.LAST_K, upright, template, state)
-    return state, [*told, cost + 0.5 * np.linalg.slogdet(A)[1]], np.linalg.inv(A)[:6, :6]
+    return state, [*told, cost + 0.5 * np.linalg.slogdet(A)[1]]
+
+
+def polish_one(samples, rays, state, upright, template):
+    """What the last steps make of it: state, told but for the evidence, covariance of shift and turn."""
+    most = (trials.POLISH_SAMPLES, trials.POLISH_RAYS)
+    for _ in range(trials.POLISH_STEPS):
+        _, A, b, _ = linearise(samples, rays, most, align.MODES, trials.LAST_K, upright, template, state)
+        state = move(state, -np.linalg.solve(A, b))
+    _, A, _, told = linearise(samples, rays, most, align.MODES, trials.LAST_K, upright, template, state)
+    return state, told, np.linalg.inv(A)[:6, :6]
 
 
 def settle(work, count, best, centre, template):
@@ -153,7 +164,7 @@ def settle(work, count, best, centre, template):
     odds /= odds.sum()
     turns = Rotation.from_matrix(R.T @ states[:, 3:12].reshape(-1, 3, 3)).as_rotvec()
     shifts = states[:, :3] - states[best, :3]
-    own = work.covariances[best]
+    own = work.covariance
     centre_covariance = template.shift_factor * R @ own[:3, :3] @ R.T
     turn_covariance = template.turn_factor * own[3:, 3:]
     for share, turn, shift in zip(odds, turns, shifts, strict=True):

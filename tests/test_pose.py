@@ -144,23 +144,27 @@ def test_one_start_equals_the_naive_twin(views):
         scratch.samples[: len(samples)], scratch.rays[: len(rays)] = samples, rays
         tried = trials.Trials.new(1)
         trials.search(scratch, len(samples), len(rays), turn[0], turn, turn, TEMPLATE, tried, 0)
-        state, told, covariance = naive_pose.align_one(samples, rays, turn[0], True, TEMPLATE)
+        state, told = naive_pose.refine_one(samples, rays, turn[0], True, TEMPLATE)
         assert tried.counts[0, trials.TRIED] == tried.counts[0, trials.REFINED] == 1
         np.testing.assert_allclose(tried.states[0, 0], state, atol=1e-6)
         np.testing.assert_allclose(tried.told[0, 0], told, rtol=1e-6)
-        np.testing.assert_allclose(tried.covariances[0, 0], covariance, rtol=1e-4, atol=1e-12)
+        trials.polish(scratch, tried, 0, 0, TEMPLATE)
+        state, told, covariance = naive_pose.polish_one(samples, rays, state, True, TEMPLATE)
+        np.testing.assert_allclose(tried.states[0, 0], state, atol=1e-6)
+        np.testing.assert_allclose(tried.told[0, 0, : align.EVIDENCE], told, rtol=1e-6)
+        np.testing.assert_allclose(tried.covariances[0], covariance, rtol=1e-4, atol=1e-12)
 
 
 def scattered(rng, count):
     """What a fit may come to: states about one another, what they cost, and covariances."""
-    work = settle.Refined(np.zeros((6, align.STATE)), np.zeros((6, align.TOLD)), np.zeros((6, 6, 6)))
+    work = settle.Refined(np.zeros((6, align.STATE)), np.zeros((6, align.TOLD)), np.zeros((6, 6)))
     for s in range(count):
         work.states[s] = random_state(rng)
         if s and rng.random() < 0.5:  # half a turn away: where rotation vectors jump
             half = Rotation.from_rotvec(np.pi * np.eye(3)[rng.integers(3)]).as_matrix()
             work.states[s, 3:12] = (work.states[0, 3:12].reshape(3, 3) @ half).reshape(9)
-        root = rng.normal(0, 0.02, (6, 6))
-        work.covariances[s] = root @ root.T
+    root = rng.normal(0, 0.02, (6, 6))
+    work.covariance[:] = root @ root.T
     work.told[:, align.EVIDENCE] = rng.normal(0, 10, len(work.told))
     return work
 

@@ -28,7 +28,7 @@ STATE = 13 + MODES  # centre (3), rotation (9) row by row, log scale, modes
 COST, ON_SURFACE, CROSSED, EVIDENCE = 0, 1, 2, 3  # what is told of a fit
 TOLD = 4
 
-ROOM = 488  # a row of the Jacobian: all points and rays in whole vectors; an odd number of lines of the cache
+ROOM = 808  # a row of the Jacobian: all points and rays in whole vectors; an odd number of lines of the cache
 INDEPENDENT = (
     120.0  # so many points at most count in full: how a head differs from the template, neighbours share
 )

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from headvox.data import F64, Expected, Frame
 from headvox.nearby import gather, sensors_of
-from headvox.settle import expect_turns, settle_all
+from headvox.settle import expect_turns, finish_all
 from headvox.template import load_template
 from headvox.threads import Threads
 from headvox.trials import Scratch, Trials, list_jobs, refine_all, search
@@ -99,13 +99,18 @@ def fit_poses(
             search(work, n, m, first[i], upright, anyhow, template, trials, i)
 
     threads.run(find, [(work,) for work in memory.scratch[:heads]])
-    jobs, taken = list_jobs(trials, heads), np.zeros(1, np.int64)
+    jobs = list_jobs(trials, heads)
+    taken, finished = np.zeros(1, np.int64), np.zeros(1, np.int64)
 
     def improve(work: Scratch) -> None:
         refine_all(work, trials, jobs, taken, template)
 
     threads.run(improve, [(work,) for work in memory.scratch[:jobs]])
-    settle_all(trials, heads, centres, template, poses)
+
+    def finish(work: Scratch) -> None:
+        finish_all(work, trials, heads, finished, centres, template, poses)
+
+    threads.run(finish, [(work,) for work in memory.scratch[:heads]])
     return poses
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from headvox.align import COST, CROSSED, EVIDENCE, ON_SURFACE
 from headvox.data import F64
 from headvox.kernels import bare_kernel, rule
-from headvox.trials import POINTS, RAYS, TRIED
+from headvox.threads import take
+from headvox.trials import MORE_POINTS, MORE_RAYS, TRIED, best_of, polish
 
 SURE_YAW_RAD = np.radians(45.0)  # an orientation that is less sure is not stated
 
@@ -21,34 +22,35 @@ class Refined(NamedTuple):
     """(S, STATE)"""
     told: F64
     """(S, TOLD)"""
-    covariances: F64
-    """(S, 6, 6) of shift and turn, in the head's axes"""
+    covariance: F64
+    """(6, 6) of shift and turn of the best, in its axes"""
 
 
 @bare_kernel
-def settle_all(trials, heads, centres, template, poses):  # type: ignore[no-untyped-def]
-    """Write the best of what was tried of each of the first ``heads`` to ``poses``."""
-    for i in range(heads):
-        refined = Refined(trials.states[i], trials.told[i], trials.covariances[i])
-        counts = trials.counts[i]
-        conclude(refined, counts[TRIED], counts[POINTS], counts[RAYS], centres[i], template, poses, i)
+def finish_all(work, trials, heads, taken, centres, template, poses):  # type: ignore[no-untyped-def]
+    """Polish the best of what was tried of each of the first ``heads``, and write it to ``poses``.
 
-
-@bare_kernel
-def conclude(refined, count, points, rays, centre, template, poses, i):  # type: ignore[no-untyped-def]
-    """Write the best of the first ``count`` of :class:`Refined` states to row ``i`` of ``poses``, if there is one.
-
-    ``points`` and ``rays`` are how many they were fitted to, ``centre`` is what they are told from.
+    Others do so too: they count the heads that are ``taken`` (1,).
     """
-    best = np.int64(0)
-    for s in range(1, count):
-        if refined.told[s, EVIDENCE] < refined.told[best, EVIDENCE]:
-            best = np.int64(s)
-    if count > 0 and np.isfinite(refined.told[best, EVIDENCE]):
-        poses.misfits[i] = refined.told[best, COST] / points
-        poses.coverages[i] = refined.told[best, ON_SURFACE] / points
-        poses.crossings[i] = refined.told[best, CROSSED] / max(rays, 1)
-        settle(refined, count, best, centre, template, poses, i)
+    while True:
+        i = take(taken, 0)
+        if i >= heads:
+            return
+        counts = trials.counts[i]
+        best = best_of(trials.told[i], counts[TRIED])
+        if best >= 0:
+            polish(work, trials, i, best, template)
+            refined = Refined(trials.states[i], trials.told[i], trials.covariances[i])
+            assess(trials.told[i, best], counts[MORE_POINTS], counts[MORE_RAYS], poses, i)
+            settle(refined, counts[TRIED], best, centres[i], template, poses, i)
+
+
+@rule
+def assess(told, points, rays, poses, i):  # type: ignore[no-untyped-def]
+    """Write to row ``i`` of ``poses`` how well a head fits, from what is ``told`` of so many points and rays."""
+    poses.misfits[i] = told[COST] / points
+    poses.coverages[i] = told[ON_SURFACE] / points
+    poses.crossings[i] = told[CROSSED] / max(rays, 1)
 
 
 @bare_kernel
@@ -60,7 +62,7 @@ def settle(refined, count, best, centre, template, poses, i):  # type: ignore[no
     """
     state = refined.states[best]
     far, turn = poses.centre_covariances[i], poses.rotation_covariances[i]
-    covariance = refined.covariances[best]
+    covariance = refined.covariance
     for a in range(3):
         poses.centres[i, a] = centre[a] + state[a]
         for b in range(3):

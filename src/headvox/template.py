@@ -10,9 +10,10 @@ import numpy as np
 
 from headvox.data import F32, F64
 
-MODES = 10
+MODES = 16
+FINE_MODES = 10  # those that lie in one line of the cache with all before them
 LINE = 16  # of a cache, in float32
-ROW = LINE  # distance, gradient (3), sigma, modes, one unused
+ROW = 2 * LINE  # distance, gradient (3), sigma, modes, the rest unused
 
 
 class Template(NamedTuple):

@@ -1,4 +1,4 @@
-"""Which pose of all: many starts on few points, of which the best few are refined on more.
+"""Which pose of all: many starts on few points, the best few refined on more, and the best of all polished on most.
 
 What is tried of a head lies in :class:`Trials`, apart from the thread that does it: the starts of a head are explored
 by one thread, but any thread refines any state, so that three heads take two threads no longer than they must.
@@ -14,11 +14,12 @@ from headvox.align import COST, EVIDENCE, PARAMETERS, ROOM, STATE, TOLD, invert,
 from headvox.data import F64, I64
 from headvox.kernels import bare_kernel, rule
 from headvox.nearby import MOST_SAMPLES, RAY, SAMPLE
-from headvox.template import MODES
+from headvox.template import FINE_MODES, MODES
 from headvox.threads import take
 
-COARSE_STEPS, FINE_STEPS = 4, 5
-COARSE_SAMPLES, FINE_SAMPLES, FINE_RAYS = 120, 300, 160
+COARSE_STEPS, FINE_STEPS, POLISH_STEPS = 4, 5, 2
+COARSE_SAMPLES, FINE_SAMPLES, POLISH_SAMPLES = 120, 240, 400
+FINE_RAYS, POLISH_RAYS = 120, 400
 COARSE_MODES = 0
 COARSE_K, FINE_K, LAST_K = (
     4.0,
@@ -27,14 +28,14 @@ COARSE_K, FINE_K, LAST_K = (
 )  # of the first coarse step (1 less each step), the first and last fine one
 MOST_STARTS = 60
 MOST_REFINED = 6
-MARGIN = 6.0  # a start that costs more than the best one by this is not refined, but for the second best
+MARGIN = 5.0  # a start that costs more than the best one by this is not refined, but for the second best
 ALIKE = 2.91  # trace of the turn between two starts that are one: 17 degrees apart
 LEAST_SAMPLES = 20  # fewer points say nothing about a pose
-POOR = 0.5  # mean cost of a point from which on an expected orientation is not trusted
+POOR = 0.4  # mean cost of a point from which on an expected orientation is not trusted: most wrong ones cost more
 ROUND_M = 0.14  # what counts as the head when we ask whether it was seen from all sides
 ROUND_SHARE = 0.35
-POINTS, RAYS, STANDS, TRIED, REFINED = 0, 1, 2, 3, 4  # what is counted of a head
-COUNTS = 5
+POINTS, RAYS, MORE_POINTS, MORE_RAYS, STANDS, TRIED, REFINED = range(7)  # what is counted of a head
+COUNTS = 7
 
 
 class Scratch(NamedTuple):
@@ -73,17 +74,21 @@ class Trials(NamedTuple):
     """What is tried of some heads: a row a head."""
 
     points: F64
-    """(H, FINE_SAMPLES, SAMPLE) the samples that are used, and"""
+    """(H, FINE_SAMPLES, SAMPLE) the samples that states are refined on, and"""
     passing: F64
     """(H, FINE_RAYS, RAY) the rays"""
+    more_points: F64
+    """(H, POLISH_SAMPLES, SAMPLE) the samples that the best state is polished on, and"""
+    more_passing: F64
+    """(H, POLISH_RAYS, RAY) the rays"""
     counts: I64
     """(H, COUNTS) how many of these, whether gravity holds, how many states are tried, and how many refined at once"""
     states: F64
     """(H, MOST_REFINED, STATE) what is tried"""
     told: F64
-    """(H, MOST_REFINED, TOLD) of these, once they are refined, and"""
+    """(H, MOST_REFINED, TOLD) of these, once they are refined"""
     covariances: F64
-    """(H, MOST_REFINED, 6, 6) of shift and turn, in the head's axes"""
+    """(H, 6, 6) of shift and turn of the best, in its axes"""
     jobs: I64
     """(H * MOST_REFINED, 2) heads and states that are left to refine"""
 
@@ -92,8 +97,9 @@ class Trials(NamedTuple):
         """Return the memory for as many ``heads``, all zeros."""
         return cls(
             np.zeros((heads, FINE_SAMPLES, SAMPLE)), np.zeros((heads, FINE_RAYS, RAY)),
+            np.zeros((heads, POLISH_SAMPLES, SAMPLE)), np.zeros((heads, POLISH_RAYS, RAY)),
             np.zeros((heads, COUNTS), np.int64), np.zeros((heads, MOST_REFINED, STATE)),
-            np.zeros((heads, MOST_REFINED, TOLD)), np.zeros((heads, MOST_REFINED, 6, 6)),
+            np.zeros((heads, MOST_REFINED, TOLD)), np.zeros((heads, 6, 6)),
             np.zeros((heads * MOST_REFINED, 2), np.int64),
         )  # fmt: skip
 
@@ -164,6 +170,8 @@ def search(work, n, m, expected, upright, anyhow, template, trials, i):  # type:
     counts = trials.counts[i]
     counts[POINTS] = choose(work.samples, n, trials.points[i], FINE_SAMPLES)
     counts[RAYS] = choose(work.rays, m, trials.passing[i], FINE_RAYS)
+    counts[MORE_POINTS] = choose(work.samples, n, trials.more_points[i], POLISH_SAMPLES)
+    counts[MORE_RAYS] = choose(work.rays, m, trials.more_passing[i], POLISH_RAYS)
     counts[TRIED] = counts[REFINED] = 0
     if n < LEAST_SAMPLES:
         return
@@ -274,12 +282,15 @@ def refine_all(work, trials, jobs, taken, template):  # type: ignore[no-untyped-
 
 @bare_kernel
 def refine(work, trials, i, at, template):  # type: ignore[no-untyped-def]
-    """Take the steps of all modes from the state ``at`` of head ``i``, on all its points and rays.
+    """Take the steps of the first modes from the state ``at`` of head ``i``.
 
-    The last state, what it costs, and its covariance are left in ``trials``.
+    The last state, and what it costs, are left in ``trials``.
     """
     A, x, state, told, counts = work.A, work.x, trials.states[i, at], trials.told[i, at], trials.counts[i]
-    modes, always = np.int64(MODES), np.bool_(True)  # constants would make Numba compile linearise for each
+    modes, always = (
+        np.int64(FINE_MODES),
+        np.bool_(True),
+    )  # constants would make Numba compile linearise for each
     for step in range(FINE_STEPS + 1):
         k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
         cost = linearise(
@@ -289,4 +300,32 @@ def refine(work, trials, i, at, template):  # type: ignore[no-untyped-def]
         told[EVIDENCE] = cost + solve(A, x, 7 + modes)
         if step < FINE_STEPS:
             move(state, x, 7 + modes)
-    invert(A, x, trials.covariances[i, at])
+
+
+@rule
+def best_of(told, count):  # type: ignore[no-untyped-def]
+    """Return which of ``count`` refined states has the best evidence; -1 where there is none."""
+    best = np.int64(0)
+    for s in range(1, count):
+        if told[s, EVIDENCE] < told[best, EVIDENCE]:
+            best = np.int64(s)
+    return best if count > 0 and np.isfinite(told[best, EVIDENCE]) else np.int64(-1)
+
+
+@bare_kernel
+def polish(work, trials, i, at, template):  # type: ignore[no-untyped-def]
+    """Take the last steps, of all modes and on more points and rays, from the state ``at`` of head ``i``.
+
+    The state, what is told of it, but for the evidence, and its covariance are left in ``trials``.
+    """
+    A, x, state, told, counts = work.A, work.x, trials.states[i, at], trials.told[i, at], trials.counts[i]
+    modes, always = np.int64(MODES), np.bool_(True)
+    for step in range(POLISH_STEPS + 1):
+        linearise(
+            trials.more_points[i], counts[MORE_POINTS], trials.more_passing[i], counts[MORE_RAYS], modes, LAST_K,
+            counts[STANDS] != 0, always, template.rows, template.low, template.voxel_m, state, work.J, A, told,
+        )  # fmt: skip
+        solve(A, x, PARAMETERS)
+        if step < POLISH_STEPS:
+            move(state, x, PARAMETERS)
+    invert(A, x, trials.covariances[i])

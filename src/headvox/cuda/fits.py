@@ -16,7 +16,15 @@ from headvox.pose import Poses, all_turns, upright_turns
 from headvox.refine import cells_about
 from headvox.settle import Refined
 from headvox.template import load_template
-from headvox.trials import COARSE_SAMPLES, FINE_RAYS, FINE_SAMPLES, MOST_REFINED, MOST_STARTS
+from headvox.trials import (
+    COARSE_SAMPLES,
+    FINE_RAYS,
+    FINE_SAMPLES,
+    MOST_REFINED,
+    MOST_STARTS,
+    POLISH_RAYS,
+    POLISH_SAMPLES,
+)
 
 if TYPE_CHECKING:
     from headvox.cuda.search import Search
@@ -49,16 +57,18 @@ class Fits:
     def _make_room_for_poses(self, frames: int, rows: int) -> None:
         each = MOST_STARTS + 1
         self.samples, self.rays = _reals(rows, MOST_SAMPLES, SAMPLE), _reals(rows, MOST_SAMPLES, RAY)
-        self.points = _reals(rows, FINE_SAMPLES + COARSE_SAMPLES, SAMPLE)
-        self.passing = _reals(rows, FINE_RAYS, RAY)
+        self.points = _reals(rows, FINE_SAMPLES + COARSE_SAMPLES + POLISH_SAMPLES, SAMPLE)
+        self.passing = _reals(rows, FINE_RAYS + POLISH_RAYS, RAY)
         self.turns = _reals(rows, 9)
         self.pose_blocks = max(POSE_BLOCKS // frames, 1)
         self.scratch = _reals(frames * self.pose_blocks, PARAMETERS + 3, pose.COLUMNS)
         self.starts = pose.Starts(
-            *(_reals(rows, each, *shape) for shape in ((), (STATE,), (STATE,), (TOLD,), (6, 6)))
+            *(_reals(rows, each, *shape) for shape in ((), (STATE,), (STATE,), (TOLD,)))
         )
         self.picked = _reals(rows, MOST_REFINED, STATE)
-        self.chosen = Refined(*(_reals(rows, MOST_REFINED, *shape) for shape in ((STATE,), (TOLD,), (6, 6))))
+        self.chosen = Refined(
+            _reals(rows, MOST_REFINED, STATE), _reals(rows, MOST_REFINED, TOLD), _reals(rows, 6, 6)
+        )
         self.upright, self.anyhow = cuda.to_device(upright_turns()), cuda.to_device(all_turns())
         template = load_template()
         self.template = template._replace(
@@ -93,9 +103,9 @@ class Fits:
             counts, self.near, self.points, self.passing, self.turns, self.upright, self.anyhow, self.template,
             self.scratch, self.starts,
         )  # fmt: skip
-        pose.settle_heads[(1, frames), MOST_POSES if not SIMULATED else 2, stream](
-            counts, self.near, self.heads, self.spheres, self.upright, self.anyhow, self.template, self.starts,
-            self.picked, self.chosen, self.poses,
+        pose.settle_heads[(min(self.pose_blocks, MOST_POSES), frames), POSE_THREADS, stream](
+            counts, self.near, self.heads, self.spheres, self.points, self.passing, self.upright, self.anyhow,
+            self.template, self.scratch, self.starts, self.picked, self.chosen, self.poses,
         )  # fmt: skip
 
 

@@ -53,6 +53,8 @@ from headvox.trials import (
     FINE_RAYS,
     FINE_SAMPLES,
     LEAST_SAMPLES,
+    POLISH_RAYS,
+    POLISH_SAMPLES,
     ROUND_SHARE,
     evenly,
     lean,
@@ -134,9 +136,9 @@ def gather(  # type: ignore[no-untyped-def]
 ):
     """Fill ``samples`` (frames * heads, S, SAMPLE) and ``rays`` (frames * heads, R, RAY) with what is near each head.
 
-    ``near`` (frames, heads, 3) tells how many there are; ``points`` (frames * heads, FINE_SAMPLES + COARSE_SAMPLES,
-    SAMPLE) and ``passing`` (frames * heads, FINE_RAYS, RAY) receive those that are used, evenly of all, and ``turns``
-    (frames * heads, 9) the rotation that is expected of each head, NaN where none is.
+    ``near`` (frames, heads, 3) tells how many there are; ``points`` (frames * heads, FINE_SAMPLES + COARSE_SAMPLES +
+    POLISH_SAMPLES, SAMPLE) and ``passing`` (frames * heads, FINE_RAYS + POLISH_RAYS, RAY) receive those that are used,
+    evenly of all, and ``turns`` (frames * heads, 9) the rotation that is expected of each head, NaN where none is.
     """
     found = cuda.shared.array((MOST_THREADS, 2), np.int32)
     around = cuda.shared.array((MOST_THREADS, 5), np.float64)
@@ -215,7 +217,9 @@ def gather(  # type: ignore[no-untyped-def]
             m += length_of(all_passes, room_m) if is_cloud else min(all_passes, room_m)
         copy_evenly(mine, n, FINE_SAMPLES, points[at_head], 0)
         copy_evenly(mine, n, COARSE_SAMPLES, points[at_head], FINE_SAMPLES)
+        copy_evenly(mine, n, POLISH_SAMPLES, points[at_head], FINE_SAMPLES + COARSE_SAMPLES)
         copy_evenly(passing_by, m, FINE_RAYS, passing[at_head], 0)
+        copy_evenly(passing_by, m, POLISH_RAYS, passing[at_head], FINE_RAYS)
         first, after = share_of(n, thread, threads)
         seen, close, x, y, z = _lean(mine, first, after)
         around[thread, 0], around[thread, 1] = seen, close

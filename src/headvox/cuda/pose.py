@@ -34,8 +34,8 @@ from headvox.cuda.blocks import share_of, sum_rows
 from headvox.cuda.lanes import MATH, device, kernel, on_device, wait_for_block
 from headvox.cuda.nearby import RAYS, ROUND, SAMPLES
 from headvox.cuda.suppress import HEADS
-from headvox.settle import Refined, column, conclude, odds, quaternion_of, settle, turn_between
-from headvox.template import MODES
+from headvox.settle import Refined, assess, column, odds, quaternion_of, settle, turn_between
+from headvox.template import FINE_MODES, MODES
 from headvox.trials import (
     COARSE_K,
     COARSE_MODES,
@@ -48,12 +48,16 @@ from headvox.trials import (
     LAST_K,
     LEAST_SAMPLES,
     MOST_REFINED,
+    POLISH_RAYS,
+    POLISH_SAMPLES,
+    POLISH_STEPS,
+    best_of,
     is_trusted,
     pick,
 )
 
 MOST_THREADS = 128  # of a block; a power of two
-COLUMNS = FINE_SAMPLES + FINE_RAYS
+COLUMNS = max(FINE_SAMPLES + FINE_RAYS, POLISH_SAMPLES + POLISH_RAYS)
 SYSTEM = PARAMETERS + 1  # rows and columns of A: the last ones are the residual's
 
 _weigh = on_device(weigh, np=MATH)
@@ -77,8 +81,6 @@ class Starts(NamedTuple):
     """(.., starts, STATE)"""
     told: Any
     """(.., starts, TOLD)"""
-    covariances: Any
-    """(.., starts, 6, 6)"""
 
 
 @device
@@ -165,7 +167,7 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
     costs = cuda.shared.array((MOST_THREADS, 1), np.float64)
     A = cuda.shared.array((SYSTEM, SYSTEM), np.float64)
     state = cuda.shared.array(STATE, np.float64)
-    x = cuda.shared.array((6, PARAMETERS), np.float64)
+    x = cuda.shared.array(PARAMETERS, np.float64)
     frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
     J = scratch[frame * cuda.gridDim.x + cuda.blockIdx.x]
     each = starts.costs.shape[1]
@@ -199,8 +201,8 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
             if step < COARSE_STEPS:
                 factor(A, 7 + COARSE_MODES, thread, threads)
                 if thread == 0:
-                    solve_back(A, 7 + COARSE_MODES, x[0])
-                    _move(state, x[0], 7 + COARSE_MODES)
+                    solve_back(A, 7 + COARSE_MODES, x)
+                    _move(state, x, 7 + COARSE_MODES)
             elif thread == 0:
                 starts.costs[at_head, start] = cost
             cuda.syncthreads()
@@ -210,30 +212,26 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
         for step in range(FINE_STEPS + 1):
             scale = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
             cost = linearise(
-                points[at_head], 0, n_fine, passing[at_head], m, MODES, scale, stands, template, state, J, A, told,
+                points[at_head], 0, n_fine, passing[at_head], m, FINE_MODES, scale, stands, template, state, J, A, told,
                 costs, thread, threads,
             )  # fmt: skip
-            factor(A, PARAMETERS, thread, threads)
+            factor(A, 7 + FINE_MODES, thread, threads)
             if thread == 0:
-                half_log_det = solve_back(A, PARAMETERS, x[0])
+                half_log_det = solve_back(A, 7 + FINE_MODES, x)
                 if step < FINE_STEPS:
-                    _move(state, x[0], PARAMETERS)
+                    _move(state, x, 7 + FINE_MODES)
                 else:
                     for k in range(TOLD):
                         starts.told[at_head, start, k] = told[0, k]
                     starts.told[at_head, start, EVIDENCE] = cost + half_log_det
             cuda.syncthreads()
-        for column_of in range(thread, 6, threads):
-            _invert_column(A, x[column_of], column_of)
-            for k in range(6):
-                starts.covariances[at_head, start, k, column_of] = x[column_of, k]
         for k in range(thread, STATE, threads):
             starts.fine[at_head, start, k] = state[k]
         cuda.syncthreads()
 
 
 @device
-def choose_refined(costs, coarse, fine, told, covariances, points, count, picked, refined):  # type: ignore[no-untyped-def]
+def choose_refined(costs, coarse, fine, told, points, count, picked, refined):  # type: ignore[no-untyped-def]
     """Copy what :func:`headvox.trials.search` would refine of ``count`` starts to ``refined``; return how many.
 
     ``points`` is how many they were fitted to. All starts are refined; the first is what is expected, if anything is.
@@ -243,7 +241,7 @@ def choose_refined(costs, coarse, fine, told, covariances, points, count, picked
     if costs[0] < MATH.inf:
         for j in range(STATE):
             picked[0, j] = fine[0, j]
-        take(fine, told, covariances, 0, refined, 0)
+        take(fine, told, 0, refined, 0)
         if _is_trusted(told[0], points):
             return 1
         tried = 1
@@ -256,21 +254,18 @@ def choose_refined(costs, coarse, fine, told, covariances, points, count, picked
             break
         for j in range(STATE):
             picked[tried, j] = coarse[1 + best, j]
-        take(fine, told, covariances, 1 + best, refined, tried)
+        take(fine, told, 1 + best, refined, tried)
         tried += 1
     return tried
 
 
 @device
-def take(fine, told, covariances, start, refined, at):  # type: ignore[no-untyped-def]
+def take(fine, told, start, refined, at):  # type: ignore[no-untyped-def]
     """Copy what a start came to to the row ``at`` of ``refined``."""
     for j in range(STATE):
         refined.states[at, j] = fine[start, j]
     for j in range(TOLD):
         refined.told[at, j] = told[start, j]
-    for i in range(6):
-        for j in range(6):
-            refined.covariances[at, i, j] = covariances[start, i, j]
 
 
 _quaternion_of = on_device(quaternion_of, np=MATH)
@@ -278,31 +273,79 @@ _turn_between = on_device(turn_between, np=MATH, quaternion_of=_quaternion_of, c
 _settle = on_device(
     settle, np=MATH, quaternion_of=_quaternion_of, turn_between=_turn_between, odds=on_device(odds, np=MATH)
 )
-_conclude = on_device(conclude, np=MATH, settle=_settle)
+_assess = on_device(assess)
+_best_of = on_device(best_of, np=MATH)
 
 
 @kernel
-def settle_heads(counts, near, heads, spheres, upright, anyhow, template, starts, picked, chosen, poses):  # type: ignore[no-untyped-def]
-    """Choose the best state of each head, and write it to ``poses``; a thread a head.
+def settle_heads(  # type: ignore[no-untyped-def]
+    counts,
+    near,
+    heads,
+    spheres,
+    points,
+    passing,
+    upright,
+    anyhow,
+    template,
+    scratch,
+    starts,
+    picked,
+    chosen,
+    poses,
+):
+    """Choose the best state of each head, polish it, and write it to ``poses``; a block a head.
 
     ``chosen`` are the states that are asked for, a row a head, and ``picked`` what they were when they were chosen.
     """
-    frame = cuda.blockIdx.y
-    for head in range(cuda.grid(1), min(counts[frame, HEADS], MOST_POSES), cuda.gridsize(1)):
+    told = cuda.shared.array((MOST_THREADS, TOLD), np.float64)
+    costs = cuda.shared.array((MOST_THREADS, 1), np.float64)
+    A = cuda.shared.array((SYSTEM, SYSTEM), np.float64)
+    x = cuda.shared.array((6, PARAMETERS), np.float64)
+    found = cuda.shared.array(2, np.int64)
+    frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
+    J = scratch[frame * cuda.gridDim.x + cuda.blockIdx.x]
+    for head in range(cuda.blockIdx.x, min(counts[frame, HEADS], MOST_POSES), cuda.gridDim.x):
         i = frame * MOST_POSES + head
-        centre = spheres[frame, heads[frame, head]]
-        clear_pose(poses, i, centre)
-        n = near[frame, head, SAMPLES]
-        if n < LEAST_SAMPLES:
-            continue
-        points, rays = min(n, FINE_SAMPLES), min(near[frame, head, RAYS], FINE_RAYS)
-        count = anyhow.shape[0] if near[frame, head, ROUND] else upright.shape[0]
-        refined = Refined(chosen.states[i], chosen.told[i], chosen.covariances[i])
-        tried = choose_refined(
-            starts.costs[i], starts.coarse[i], starts.fine[i], starts.told[i], starts.covariances[i], points, count,
-            picked[i], refined,
-        )  # fmt: skip
-        _conclude(refined, tried, points, rays, centre, template, poses, i)
+        centre, n, m = spheres[frame, heads[frame, head]], near[frame, head, SAMPLES], near[frame, head, RAYS]
+        stands = not near[frame, head, ROUND]
+        refined = Refined(chosen.states[i], chosen.told[i], chosen.covariance[i])
+        if thread == 0:
+            clear_pose(poses, i, centre)
+            found[0] = 0
+            if n >= LEAST_SAMPLES:
+                found[0] = choose_refined(
+                    starts.costs[i], starts.coarse[i], starts.fine[i], starts.told[i], min(n, FINE_SAMPLES),
+                    upright.shape[0] if stands else anyhow.shape[0], picked[i], refined,
+                )  # fmt: skip
+            found[1] = _best_of(refined.told, found[0])
+        cuda.syncthreads()
+        best = found[1]
+        if best >= 0:
+            state = refined.states[best]
+            more, passes = min(n, POLISH_SAMPLES), min(m, POLISH_RAYS)
+            for step in range(POLISH_STEPS + 1):
+                linearise(
+                    points[i], FINE_SAMPLES + COARSE_SAMPLES, more, passing[i, FINE_RAYS:], passes, MODES, LAST_K,
+                    stands, template, state, J, A, told, costs, thread, threads,
+                )  # fmt: skip
+                factor(A, PARAMETERS, thread, threads)
+                if thread == 0:
+                    solve_back(A, PARAMETERS, x[0])
+                    if step < POLISH_STEPS:
+                        _move(state, x[0], PARAMETERS)
+                cuda.syncthreads()
+            for column_of in range(thread, 6, threads):
+                _invert_column(A, x[column_of], column_of)
+                for k in range(6):
+                    refined.covariance[k, column_of] = x[column_of, k]
+            cuda.syncthreads()
+            if thread == 0:
+                for k in range(EVIDENCE):
+                    refined.told[best, k] = told[0, k]
+                _assess(refined.told[best], more, passes, poses, i)
+                _settle(refined, found[0], best, centre, template, poses, i)
+        cuda.syncthreads()
 
 
 @device

@@ -401,6 +401,16 @@ def see_places(images, places, sight: float) -> list[int]:
 # ----------------------------------------------------------------------------------------------------------- suppress
 
 
+def best_of_each(cells: np.ndarray, scores, group: int, least) -> list[int]:
+    """Return the first best of every ``group`` cells, without such as score too low or were best before."""
+    best: dict[tuple[int, ...], int] = {}
+    for first in range(0, len(cells), group):
+        i = max(range(first, first + group), key=lambda k: scores[k])
+        if scores[i] >= least:
+            best.setdefault(tuple(cells[i].tolist()), i)
+    return list(best.values())
+
+
 def suppress(cells: np.ndarray, scores: np.ndarray, least: int, reach: int = 1) -> np.ndarray:
     """Return the candidates that beat every neighbour; of equal neighbours the first wins."""
     number = {tuple(cell): i for i, cell in enumerate(cells.tolist())}

@@ -2,7 +2,7 @@ import naive
 import numpy as np
 import pytest
 
-from headvox.suppress import suppress, suppress_overlaps
+from headvox.suppress import best_of_each, suppress, suppress_overlaps
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -16,6 +16,19 @@ def test_equals_the_naive_twin(seed, values, reach):
     for least in (-(2**40) + 1, 0):
         peaks = suppress(cells, scores, least, shape, reach)
         np.testing.assert_array_equal(peaks, naive.suppress(cells, scores, least, reach))
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("values", [1, 3, 1000])
+def test_the_best_of_each_group_equals_the_naive_twin(seed, values):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, 3, (7 * 20, 3)).astype(np.int32)
+    scores = rng.integers(-values, values, len(cells))
+    for least in (-values, 0, values + 1):
+        best = np.empty(20, np.int64)
+        wanted = naive.best_of_each(cells, scores, 7, least)
+        assert best[: best_of_each(cells, scores, 7, least, best)].tolist() == wanted
+        assert len(wanted) < 20
 
 
 def test_no_candidate_and_one_candidate():

@@ -109,22 +109,24 @@ def list_passed(passed, region, survivors):  # type: ignore[no-untyped-def]
 
     Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
     """
-    found = 0
-    for x in range(passed.shape[0]):
-        for y in range(passed.shape[1]):
-            for k in range(0, passed.shape[2], 2):
-                evens, odds = passed[x, y, k], passed[x, y, k + 1]
-                bits = evens | odds
-                while bits:
-                    lane = lowest(bits)
-                    bits &= bits - np.uint32(1)
-                    for j in range(2):
-                        if (odds if j else evens) >> np.uint32(lane) & np.uint32(1):
-                            if found < survivors.shape[0]:
-                                survivors[found, 0] = region[0] + x
-                                survivors[found, 1] = region[2] + y
-                                survivors[found, 2] = region[4] + LANES * k + 2 * lane + j
-                            found += 1
+    words, found = passed.reshape(-1), 0
+    for at in range(0, words.shape[0], 2):
+        evens, odds = words[np.uint64(at)], words[np.uint64(at + 1)]
+        bits = evens | odds
+        if bits == 0:  # almost everywhere
+            continue
+        column, k = divmod(at, passed.shape[2])
+        x, y = divmod(column, passed.shape[1])
+        while bits:
+            lane = lowest(bits)
+            bits &= bits - np.uint32(1)
+            for j in range(2):
+                if (odds if j else evens) >> np.uint32(lane) & np.uint32(1):
+                    if found < survivors.shape[0]:
+                        survivors[found, 0] = region[0] + x
+                        survivors[found, 1] = region[2] + y
+                        survivors[found, 2] = region[4] + LANES * k + 2 * lane + j
+                    found += 1
     return found
 
 

@@ -33,9 +33,10 @@ class Memory:
         counting = cascade.source.counting
         cell_type = np.uint32 if counting else np.uint8
         sum_type = np.uint32 if counting or cascade.largest_sum > 0xFFFF else np.uint16
+        self.cascade = cascade
         self.place(lattice)
         self.dirty: tuple[int, int] | None = (0, 0)
-        self.grids = np.zeros((threads, room_for(math.prod(lattice.shape))), cell_type)
+        self.grids = _touched((threads, room_for(math.prod(lattice.shape))), cell_type)
         """The cells as each thread entered them, see :func:`headvox.integral.integrate`."""
         self.marking = [Marking.of(LANES) for _ in range(threads)]
         tables = [part.boxes for part in (cascade.gate, cascade.stages, cascade.votes) if part is not None]
@@ -45,7 +46,7 @@ class Memory:
             tables += [cascade.judge.boxes + one for one in (-1, 1)]
         self.reach = box_reach(np.concatenate(tables))
         slices, *slice_shape = shape_with_margins(lattice.shape, self.reach)
-        self.S = np.empty(self.cut(lattice.shape[0], threads).slices * math.prod(slice_shape), sum_type)
+        self.S = _touched((self.cut(lattice.shape[0], threads).slices * math.prod(slice_shape),), sum_type)
         self.row = [row_for(slice_shape[1], sum_type) for _ in range(threads)]
         self.index = np.zeros(slices * math.prod(slice_shape), np.int32)
         self.first = np.zeros(3, np.int64)
@@ -54,7 +55,7 @@ class Memory:
         self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.int64)
         self.candidate_reach = candidate_reach(cascade.gate)
         whole = np.array([0, lattice.shape[0], 0, lattice.shape[1], 0, lattice.shape[2]])
-        self.passed = np.empty(math.prod(shape_of_passed(whole)), np.uint32)
+        self.passed = _touched((math.prod(shape_of_passed(whole)),), np.uint32)
         self.survivors = np.empty((4096, 3), np.int32)
         self.parts = [np.empty((ROWS, MOST_PARTS)) for _ in range(threads)]
         self.unseen = np.zeros((1, 1, 2), np.int32)
@@ -108,6 +109,11 @@ class Memory:
             self.alive = np.empty(2 * candidates, np.int64)
             self.yaws = np.zeros(2 * candidates, np.int32)
             self.peaks = np.empty(2 * candidates, np.int64)
+
+
+def _touched(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Return zeros that are written, so that no frame has to wait for the system to fetch their pages."""
+    return np.full(shape, 0, dtype)
 
 
 @dataclass(frozen=True, slots=True)

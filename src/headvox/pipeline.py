@@ -30,7 +30,7 @@ from headvox.pose import fit_poses
 from headvox.read_masks import load_cascade
 from headvox.refine import fit_spheres
 from headvox.slabs import shares_of
-from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, local_maxima
+from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, best_of_each, local_maxima
 from headvox.threads import Threads
 from headvox.visibility import count_states, look_about
 from headvox.vote import DROPPED, vote_masks, vote_stages
@@ -85,6 +85,10 @@ class Detector:
         self._threads = Threads(self.config.threads)
         self._placing = Placing(self.config)
         self._memory: Memory | None = None
+        if (
+            not self.on_device
+        ):  # so that the first frame takes no longer than others: all regions have one shape
+            self._memory_for(Frame(0))
         self._looked_at: tuple[Memory, I32, I64] | None = None
 
     # ------------------------------------------------------------------------------------------- the public calls
@@ -332,12 +336,8 @@ class Detector:
         memory.make_room(len(about))
         scores = np.empty(len(about), np.int64)
         self._score(S, about, memory.unseen, judge, memory, scores)
-        best = np.arange(len(cells)) * len(around) + scores.reshape(len(cells), -1).argmax(axis=1)
-        best = best[scores[best] > DROPPED]
-        places: dict[tuple[int, ...], int] = {}  # neighbours may meet at the same voxel
-        for i, cell in zip(best.tolist(), about[best].tolist(), strict=True):
-            places.setdefault(tuple(cell), i)
-        best = np.fromiter(places.values(), np.int64, len(places))
+        best = np.empty(len(cells), np.int64)
+        best = best[: best_of_each(about, scores, len(around), DROPPED + 1, best)]
         return about[best], scores[best], best // len(around)
 
     def _look_about(
@@ -411,15 +411,14 @@ class Detector:
     # -------------------------------------------------------------------------------------------- working memory
 
     def _memory_for(self, frame: Frame) -> Memory:
-        """Return the working memory, made anew only when the region has another shape."""
-        lattice = self._placing.lattice(frame, self.cascade)
-        if self._memory is None or self._memory.lattice is not lattice:
-            if self._memory is None or self._memory.lattice.shape != lattice.shape:
-                self._memory = Memory(
-                    lattice, self.cascade, self.config.threads, self.config.refine == "pose"
-                )
-            self._memory.place(lattice)
-        return self._memory
+        """Return the working memory, made anew only for another cascade or a region of another shape."""
+        lattice, memory = self._placing.lattice(frame, self.cascade), self._memory
+        if memory is None or memory.cascade is not self.cascade or memory.lattice.shape != lattice.shape:
+            poses = self.config.refine == "pose"
+            memory = self._memory = Memory(lattice, self.cascade, self.config.threads, poses)
+        if memory.lattice is not lattice:
+            memory.place(lattice)
+        return memory
 
 
 def _warn(text: str) -> None:

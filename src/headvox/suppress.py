@@ -58,6 +58,30 @@ def local_maxima(cells, scores, least, reach, index, peaks):  # type: ignore[no-
     return found
 
 
+@kernel
+def best_of_each(cells, scores, group, least, best):  # type: ignore[no-untyped-def]
+    """Write the index of the best of every ``group`` cells to ``best``; return how many there are.
+
+    Of equals it is the first. Left out are those that score less than ``least`` and cells that were best before:
+    groups may meet at one.
+    """
+    found = 0
+    for first in range(0, cells.shape[0], group):
+        i = first
+        for k in range(first + 1, first + group):
+            if scores[k] > scores[i]:
+                i = k
+        is_new = scores[i] >= least
+        for k in range(found):
+            j = best[k]
+            if cells[i, 0] == cells[j, 0] and cells[i, 1] == cells[j, 1] and cells[i, 2] == cells[j, 2]:
+                is_new = False
+        if is_new:
+            best[found] = i
+            found += 1
+    return found
+
+
 def suppress(cells: I32, scores: I64, least: int, shape: tuple[int, ...], reach: int = 1) -> I64:
     """Return the indices of the candidates that score at least ``least`` and more than all within ``reach`` voxels.
 

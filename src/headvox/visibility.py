@@ -62,15 +62,11 @@ def pixel_of(camera, x, y, z):  # type: ignore[no-untyped-def]
 @rule
 def state_at(raw, camera, far):  # type: ignore[no-untyped-def]
     """Return EMPTY, HIDDEN or 0 for a cell so ``far`` away whose pixel measured ``raw``."""
-    if raw == 0:
-        return 0
     measured = np.float32(raw) * camera[3, 0]
     margin = camera[3, 1] + product(camera[3, 2] * far, far)
-    if measured > far + margin:
-        return 2
-    if measured < far - margin:
-        return 1
-    return 0
+    # Numbers, not branches: what a pixel measured is nothing that a processor could guess.
+    is_empty, is_hidden = measured > far + margin, measured < far - margin
+    return (EMPTY * is_empty + HIDDEN * is_hidden) * (raw != 0)
 
 
 @rule

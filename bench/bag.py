@@ -21,10 +21,10 @@ from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
-from headvox.bench_input import describe_machine
+from headvox.bench.input import describe_machine
+from headvox.commands.table import table
 from headvox.data import Frame
 from headvox.sources import open_source
-from headvox.table import table
 
 WIDTH, HEIGHT, STEP = 848, 480, 24
 NS = 1_000_000_000

@@ -19,16 +19,16 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from headvox.align import EVIDENCE
 from headvox.data import Cloud, Expected, Frame
 from headvox.errors import HeadvoxError
-from headvox.pose import FitMemory, fit_poses
+from headvox.machine.threads import Threads
+from headvox.parallel.workers import Workers
+from headvox.pose.align import EVIDENCE
+from headvox.pose.fit import FitMemory, fit_poses
+from headvox.pose.trials import TRIED, Trials
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
-from headvox.threads import Threads
-from headvox.trials import TRIED, Trials
-from headvox.workers import Workers
 
 EVALUATION = (
     0x6A5E  # people of no other seed were fitted to; those of 0xE7A1 were measured by earlier versions

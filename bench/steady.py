@@ -27,14 +27,14 @@ from pathlib import Path
 import numpy as np
 
 from headvox.evaluate.scenarios import recording
+from headvox.parallel.workers import Workers, add_flags, of_flags
 from headvox.pipeline import Detector
 from headvox.synth.motion import staying
 from headvox.synth.portraits import portrait
 from headvox.synth.presets import two_cameras
 from headvox.synth.record import stamps, write_recording
 from headvox.synth.scene import Scene
-from headvox.track import Tracker
-from headvox.workers import Workers, add_flags, of_flags
+from headvox.tracking.tracker import Tracker
 
 HZ = 30
 STEADY = 0x57EAD

@@ -37,7 +37,7 @@ from headvox.evaluate.match import Rules
 from headvox.evaluate.metrics import Sample
 from headvox.evaluate.tracking import score_tracks
 from headvox.evaluate.truth import NO_ID, TrueHeads
-from headvox.track import Tracker
+from headvox.tracking.tracker import Tracker
 
 CAMERA = Intrinsics(160, 90, 90.0, 90.0, 79.5, 44.5)
 T_WORLD_CAMERA = np.array(

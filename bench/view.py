@@ -22,7 +22,7 @@ import headvox
 from headvox.data import Frame
 from headvox.run import look
 from headvox.sample import sample_folder
-from headvox.track import Tracker
+from headvox.tracking.tracker import Tracker
 from headvox.view.watch import SHOWN_HZ, Watch
 from headvox.warmup import warm_up
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from PIL import Image
 
 from headvox.cli import main as headvox
-from headvox.plot_masks import plot_cascade
-from headvox.read_masks import load_cascade, shipped_cascades
+from headvox.masks.plot import plot_cascade
+from headvox.masks.read import load_cascade, shipped_cascades
 
 
 def save_small(drawn: Path, path: Path, width: int = 1100) -> Path:

@@ -8,7 +8,6 @@ import scenes
 from numba import cuda
 
 from headvox import Cloud, Frame
-from headvox import pose as pose_on_cpu
 from headvox.cuda import fits as fits_module
 from headvox.cuda import (
     readings,
@@ -17,7 +16,8 @@ from headvox.cuda import (
 )
 from headvox.cuda.device import is_simulated
 from headvox.integral import integral_volume
-from headvox.read_masks import parse_cascade
+from headvox.masks.read import parse_cascade
+from headvox.pose import fit as pose_on_cpu
 
 sys.setswitchinterval(2e-5)  # the simulator's threads wait for each other busily
 

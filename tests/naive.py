@@ -16,7 +16,7 @@ import numpy as np
 
 from headvox.data import Cloud, DepthImage, Frame
 from headvox.fuse import Region
-from headvox.masks import Box, Cascade, Condition, Group, Votes
+from headvox.masks.cascade import Box, Cascade, Condition, Group, Votes
 
 DROPPED = -(2**40)
 SCORE_UNIT = 1024

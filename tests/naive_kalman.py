@@ -1,4 +1,4 @@
-"""The filters of a track in plain matrix algebra, as a textbook has them: twin of headvox.kalman."""
+"""The filters of a track in plain matrix algebra, as a textbook has them: twin of headvox.tracking.kalman."""
 
 from __future__ import annotations
 

@@ -6,10 +6,10 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from headvox import align, nearby, trials
-from headvox import settle as settling
-from headvox import template as template_of
 from headvox.data import Frame
+from headvox.pose import align, nearby, trials
+from headvox.pose import settle as settling
+from headvox.pose import template as template_of
 
 
 def gather(frame: Frame, centre, reach=nearby.REACH_M):

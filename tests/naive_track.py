@@ -1,12 +1,12 @@
-"""What a tracker does with each track, one after another: twin of headvox.identity, noise and lifetime."""
+"""What a tracker does with each track, one after another: twin of headvox.tracking.identity, noise and lifetime."""
 
 from __future__ import annotations
 
 import naive_kalman as kalman
 import numpy as np
 
-from headvox import identity, noise
-from headvox.lifetime import MOST_DRAIN, WEAK
+from headvox.tracking import identity, noise
+from headvox.tracking.lifetime import MOST_DRAIN, WEAK
 from headvox.visibility import BEHIND, OUT_OF_VIEW
 
 

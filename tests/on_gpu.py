@@ -26,7 +26,6 @@ from gpu_arrays import (
 from numba import cuda
 
 from headvox import Cloud, DepthImage, Frame, Intrinsics
-from headvox.compile_masks import compile_cascade
 from headvox.cuda import (
     compact,
     gate,
@@ -40,7 +39,8 @@ from headvox.cuda import (
 )
 from headvox.gate import gate_tables, pass_gate
 from headvox.integral import integral_volume
-from headvox.read_masks import load_cascade, parse_cascade
+from headvox.masks.compile import compile_cascade
+from headvox.masks.read import load_cascade, parse_cascade
 from headvox.suppress import suppress as suppress_on_cpu
 from headvox.visibility import cells_of, count_seen
 from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes

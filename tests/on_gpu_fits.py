@@ -20,9 +20,7 @@ from gpu_arrays import (
 from numba import cuda
 from test_pipeline import camera_frame
 
-from headvox import Cloud, Frame, align, assemble, trials
-from headvox import nearby as nearby_on_cpu
-from headvox import pose as pose_on_cpu
+from headvox import Cloud, Frame, assemble
 from headvox.cuda import fits as fits_module
 from headvox.cuda import (
     nearby,
@@ -34,11 +32,14 @@ from headvox.cuda import (
 from headvox.cuda.device import is_simulated
 from headvox.cuda.fits import Fits
 from headvox.data import Expected
-from headvox.nearby import gather_points, sensors_of
-from headvox.pose import Poses
+from headvox.machine.threads import Threads
+from headvox.pose import align, trials
+from headvox.pose import fit as pose_on_cpu
+from headvox.pose import nearby as nearby_on_cpu
+from headvox.pose.fit import Poses
+from headvox.pose.nearby import gather_points, sensors_of
 from headvox.refine import COUNT, HAIR_M, MOST_PARTS, RADIUS, ROWS, fit_spheres
 from headvox.suppress import suppress_overlaps
-from headvox.threads import Threads
 from headvox.voxelize import Lattice, Rays
 
 # The simulator computes as NumPy's scalars do, which tell of what the hardware does silently.

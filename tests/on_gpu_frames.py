@@ -21,7 +21,6 @@ from test_pipeline import NARROW, SMALL, camera_frame, two_busts
 
 from headvox import Cloud, Detector, Frame, HeadvoxError, Intrinsics
 from headvox.cli import main
-from headvox.compile_masks import compile_cascade
 from headvox.config import DetectorConfig
 from headvox.cuda import (
     compact,
@@ -31,6 +30,7 @@ from headvox.cuda import (
 from headvox.cuda.device import BATCH, check_device, is_simulated
 from headvox.data import Expected
 from headvox.fuse import Region
+from headvox.masks.compile import compile_cascade
 from headvox.voxelize import Lattice
 
 # The simulator computes as NumPy's scalars do, which tell of what the hardware does silently.

@@ -19,9 +19,9 @@ import scenes
 from numba import cuda
 from numba.cuda import dispatcher
 
-from headvox.compile_masks import compile_cascade
 from headvox.data import Cloud, Frame
-from headvox.read_masks import load_cascade, parse_cascade
+from headvox.masks.compile import compile_cascade
+from headvox.masks.read import load_cascade, parse_cascade
 from headvox.suppress import AROUND
 from headvox.voxelize import Lattice
 

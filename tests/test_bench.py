@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from headvox import bench, cli
+from headvox import cli
+from headvox.bench import command as bench
 from headvox.pipeline import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from headvox.cholesky import factor, substitute
+from headvox.machine.cholesky import factor, substitute
 
 
 @pytest.mark.parametrize("size", [1, 4, 17])

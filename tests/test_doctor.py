@@ -7,8 +7,8 @@ from importlib.metadata import metadata
 
 import pytest
 
-from headvox import doctor
 from headvox.cli import main
+from headvox.commands import doctor
 
 
 def test_everything_is_told_and_heads_are_found(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,7 +52,8 @@ def test_a_distance_that_is_too_large_is_not_found(monkeypatch: pytest.MonkeyPat
 
 
 def test_looking_for_it_imports_nothing_heavy() -> None:
-    script = "import sys; from headvox import doctor; doctor._gpu(); doctor._ros(); doctor._extra('view', ('rerun',));"
+    script = "import sys; from headvox.commands import doctor; "
+    script += "doctor._gpu(); doctor._ros(); doctor._extra('view', ('rerun',));"
     script += "print(*{'numba', 'rerun', 'rclpy', 'pyrealsense2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from headvox.cli import main
-from headvox.compile_masks import compile_cascade
 from headvox.data import Cloud, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.evolve import bank, boost, gates, samples, search, views
@@ -19,7 +18,8 @@ from headvox.evolve.check import Outcome, check
 from headvox.evolve.write import Found, cascade_text, write_cascade
 from headvox.frames import inverse, transform
 from headvox.gate import pass_gate
-from headvox.read_masks import load_cascade, parse_cascade
+from headvox.masks.compile import compile_cascade
+from headvox.masks.read import load_cascade, parse_cascade
 from headvox.synth.scene import TrueHead
 from headvox.vote import DROPPED, score_by_stages
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scenes
 
-from headvox.compile_masks import compile_cascade
 from headvox.gate import gate_columns, gate_tables, list_passed, pass_gate, shape_of_passed
 from headvox.integral import box_reach, integral_volume, set_corners, with_margins
-from headvox.masks import Box, Cascade, Condition, Group
-from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
+from headvox.masks.cascade import Box, Cascade, Condition, Group
+from headvox.masks.compile import compile_cascade
+from headvox.masks.read import load_cascade, parse_cascade, shipped_cascades
 
 HEAD = """
 format = "headvox-cascade"

@@ -7,9 +7,9 @@ import naive_track as naive
 import numpy as np
 import pytest
 
-from headvox import identity, noise
-from headvox.lifetime import ELSEWHERE, age, judge_new, missing, turn_page
-from headvox.roster import blank
+from headvox.tracking import identity, noise
+from headvox.tracking.lifetime import ELSEWHERE, age, judge_new, missing, turn_page
+from headvox.tracking.roster import blank
 
 NOW_NS, BEFORE_NS = 10_000_000_000, 9_900_000_000
 

@@ -16,7 +16,7 @@ def loaded_after(code: str) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "module", ["headvox", "headvox.data", "headvox.errors", "headvox.config", "headvox.masks"]
+    "module", ["headvox", "headvox.data", "headvox.errors", "headvox.config", "headvox.masks.cascade"]
 )
 def test_import_waits_for_nothing_heavy(module):
     assert not loaded_after(f"import {module}") & set(HEAVY)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from headvox import kalman
-from headvox.roster import blank
+from headvox.tracking import kalman
+from headvox.tracking.roster import blank
 
 TIGHT = {"rtol": 1e-9, "atol": 1e-12}
 PLACE_NOISE, TURN_NOISE = np.array([0.8, 0.7, 0.1]), np.array([3.0, 2.0, 4.0])

@@ -1,7 +1,7 @@
 import threading
 import time
 
-from headvox.latest import Latest
+from headvox.machine.latest import Latest
 
 
 def test_the_newest_wins_and_the_others_are_counted():

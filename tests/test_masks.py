@@ -9,12 +9,12 @@ import tomllib
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headvox import read_masks
-from headvox.compile_masks import compile_cascade, voxel_box, voxel_range
 from headvox.errors import HeadvoxError
 from headvox.integral import integral_volume
-from headvox.masks import Box, ring
-from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
+from headvox.masks import read as read_masks
+from headvox.masks.cascade import Box, ring
+from headvox.masks.compile import compile_cascade, voxel_box, voxel_range
+from headvox.masks.read import load_cascade, parse_cascade, shipped_cascades
 
 VOXELS = [k / 100 for k in range(1, 11)] + [0.025, 0.0125, 1 / 30]
 STAGES, VOTES = tomllib.loads(scenes.STAGES), tomllib.loads(scenes.VOTES)

@@ -9,7 +9,7 @@ from headvox import Cloud, DepthImage, Detector, Frame, Heads, HeadvoxError, Int
 from headvox.config import DetectorConfig
 from headvox.data import BadFrame, Expected
 from headvox.fuse import Region
-from headvox.read_masks import load_cascade, parse_cascade
+from headvox.masks.read import load_cascade, parse_cascade
 
 SMALL = {
     "max_range_m": 0.7,

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 from headvox import cli
-from headvox.describe_masks import describe_cascade
-from headvox.mask_pictures import GREEN, RED, influence_of_features, influence_of_groups, pictures_of
-from headvox.masks import Cascade
-from headvox.plot_masks import plot_cascade
-from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
-from headvox.table import file_name
+from headvox.commands.table import file_name
+from headvox.masks.cascade import Cascade
+from headvox.masks.describe import describe_cascade
+from headvox.masks.pictures import GREEN, RED, influence_of_features, influence_of_groups, pictures_of
+from headvox.masks.plot import plot_cascade
+from headvox.masks.read import load_cascade, parse_cascade, shipped_cascades
 
 pytest.importorskip("matplotlib")
 

@@ -4,15 +4,16 @@ import pytest
 import scenes
 from scipy.spatial.transform import Rotation
 
-from headvox import Cloud, DepthImage, Frame, Intrinsics, align, nearby, settle, trials
+from headvox import Cloud, DepthImage, Frame, Intrinsics
 from headvox.data import Expected
-from headvox.pose import FitMemory, Poses, all_turns, expected_turns, fit_poses, upright_turns
+from headvox.machine.threads import Threads
+from headvox.pose import align, nearby, settle, trials
+from headvox.pose.fit import FitMemory, Poses, all_turns, expected_turns, fit_poses, upright_turns
+from headvox.pose.template import load_template
+from headvox.pose.trials import Scratch
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
-from headvox.template import load_template
-from headvox.threads import Threads
-from headvox.trials import Scratch
 
 TEMPLATE = load_template()
 SURE_DEG = 15.0  # a yaw that is stated to this counts as known, see bench/refine.py

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from headvox.data import State
-from headvox.report import LEAST_REACH_M, MOST_REACH_M, expectations, report
-from headvox.roster import blank
+from headvox.tracking.report import LEAST_REACH_M, MOST_REACH_M, expectations, report
+from headvox.tracking.roster import blank
 
 LAST_NS, STAMP_NS = 10_000_000_000, 10_050_000_000
 

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from headvox.kernels import bare_kernel
-from headvox.simd import (
+from headvox.machine.kernels import bare_kernel
+from headvox.machine.simd import (
     LANES,
     add,
     beginning,

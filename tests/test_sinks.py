@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from headvox.commands.live import Live
+from headvox.commands.table import printable, table
 from headvox.data import Frame, Heads
 from headvox.errors import HeadvoxError
-from headvox.live import Live
 from headvox.run import Report
 from headvox.sinks import Result, open_sink
 from headvox.sinks.jsonl import JsonStream, to_json
-from headvox.table import printable, table
-from headvox.track import Tracker
+from headvox.tracking.tracker import Tracker
 
 HEADS = Heads(
     np.array([[1.00004, -2.0, -0.00001]]),

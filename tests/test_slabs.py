@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from headvox.kernels import kernel
+from headvox.machine.kernels import kernel
 from headvox.slabs import ONE_SLAB, Slabs, cut, shares_of, slice_of
 
 

@@ -7,8 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from headvox.kernels import bare_kernel
-from headvox.threads import Threads, take
+from headvox.machine.kernels import bare_kernel
+from headvox.machine.threads import Threads, take
 
 
 @bare_kernel
@@ -130,7 +130,7 @@ def test_after_an_interrupt_all_goes_on():
 
 FORK = """
 import os
-from headvox.threads import Threads
+from headvox.machine.threads import Threads
 
 threads, done = Threads(2), []
 threads.run(done.append, [(0,), (1,)])

@@ -12,10 +12,10 @@ import scenes
 from headvox.config import TrackerConfig
 from headvox.data import Cloud, DepthImage, Frame, Heads, Intrinsics, State, Tracks
 from headvox.errors import HeadvoxError
-from headvox.noise import measurement_noise
 from headvox.pipeline import Detector
 from headvox.sources import open_source
-from headvox.track import FIRST_TRUST, Tracker
+from headvox.tracking.noise import measurement_noise
+from headvox.tracking.tracker import FIRST_TRUST, Tracker
 
 FILINHA = Path(__file__).parents[1].parent / "shared" / "data" / "recordings" / "filinha"
 MS = 1_000_000

@@ -20,7 +20,7 @@ from headvox.errors import HeadvoxError
 from headvox.render.colours import HEADS
 from headvox.run import look
 from headvox.sinks import Result
-from headvox.track import Tracker
+from headvox.tracking.tracker import Tracker
 from headvox.view.mailbox import Mailbox, letters
 from headvox.view.watch import Watch
 

@@ -6,11 +6,11 @@ import pytest
 import scenes
 from test_gate import random_cells
 
-from headvox.compile_masks import compile_cascade
 from headvox.integral import integral_volume
-from headvox.masks import Stage
-from headvox.read_masks import load_cascade, parse_cascade, shipped_cascades
-from headvox.simd import LANES
+from headvox.machine.simd import LANES
+from headvox.masks.cascade import Stage
+from headvox.masks.compile import compile_cascade
+from headvox.masks.read import load_cascade, parse_cascade, shipped_cascades
 from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes, statistics_of
 
 SMALL = parse_cascade(scenes.STAGES, "small")

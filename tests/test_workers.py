@@ -12,17 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from headvox import batch, cluster
 from headvox.config import DetectorConfig
 from headvox.errors import HeadvoxError, Undecided
 from headvox.evaluate import scenarios as scenario
 from headvox.evaluate.match import Rules
 from headvox.evaluate.outcome import Outcome, Plan, evaluate_all, pooled
+from headvox.parallel import batch, cluster
+from headvox.parallel.workers import ALONE, Workers
 from headvox.sources.options import SourceOptions
 from headvox.sources.remote import fetched
 from headvox.synth import mannequin, presets
 from headvox.synth.record import stamps, write_recording
-from headvox.workers import ALONE, Workers
 
 
 def square(n: int) -> int:

@@ -26,18 +26,18 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from headvox.align import EVIDENCE
 from headvox.data import Intrinsics
 from headvox.frames import inverse, transform
-from headvox.kernels import kernel
-from headvox.pose import FitMemory, fit_poses
+from headvox.machine.kernels import kernel
+from headvox.machine.threads import Threads
+from headvox.parallel.workers import Workers
+from headvox.pose.align import EVIDENCE
+from headvox.pose.fit import FitMemory, fit_poses
+from headvox.pose.trials import TRIED
 from headvox.synth.people import PosedBody, pose_person, sample_person, sample_pose
 from headvox.synth.people import _rest as rest
 from headvox.synth.portraits import portrait
 from headvox.synth.rays import Mesh, look
-from headvox.threads import Threads
-from headvox.trials import TRIED
-from headvox.workers import Workers
 
 TRAINING = 0x7E3A1
 POSTURES = ("standing", "walking", "sitting", "bending", "crouching", "lying")

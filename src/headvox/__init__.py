@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from headvox.pipeline import Detector as Detector
     from headvox.sample import sample_folder as sample_folder
     from headvox.sources import open_source as open_source
-    from headvox.track import Tracker as Tracker
+    from headvox.tracking.tracker import Tracker as Tracker
 
 # Names are imported when they are first used: `import headvox` must not wait for Numba.
 _HOME = {
@@ -30,7 +30,7 @@ _HOME = {
     "Heads": "headvox.data",
     "HeadvoxError": "headvox.errors",
     "Intrinsics": "headvox.data",
-    "Tracker": "headvox.track",
+    "Tracker": "headvox.tracking.tracker",
     "open_source": "headvox.sources",
     "sample_folder": "headvox.sample",
 }

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import SCORE_UNIT
 from headvox.data import F64, Heads
-from headvox.pose import Poses
+from headvox.masks.compile import SCORE_UNIT
+from headvox.pose.fit import Poses
 from headvox.refine import HAIR_M
 from headvox.suppress import suppress_overlaps
 

@@ -16,9 +16,10 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from headvox import __version__, completion, doctor, masks_command
-from headvox.errors import HeadvoxError, Undecided
-from headvox.flags import (
+from headvox import __version__
+from headvox.commands import completion, doctor
+from headvox.commands import masks as masks_command
+from headvox.commands.flags import (
     GOOD,
     INTERRUPTED,
     KNOWN_ERROR,
@@ -35,14 +36,15 @@ from headvox.flags import (
     source_options_of,
     tracker_config_of,
 )
+from headvox.commands.table import printable, table
+from headvox.errors import HeadvoxError, Undecided
+from headvox.parallel.workers import add_flags, of_flags
 from headvox.render import command as render_command
 from headvox.sinks import SUFFIXES
-from headvox.table import printable, table
 from headvox.view import command as view_command
-from headvox.workers import add_flags, of_flags
 
 if TYPE_CHECKING:
-    from headvox.batch import Done
+    from headvox.parallel.batch import Done
 
 # Commands that read their own flags: `headvox NAME ...` is main([...]) of a module, which returns the code.
 MODULES = {
@@ -52,7 +54,7 @@ MODULES = {
         "measure how good it is, on the paper's scenarios and on recordings",
     ),
     "align": ("headvox.calibrate.command", "tell where cameras stand, by the floor and by people who walk"),
-    "bench": ("headvox.bench", "measure how fast it is here"),
+    "bench": ("headvox.bench.command", "measure how fast it is here"),
 }
 
 DESCRIPTION = (
@@ -158,7 +160,7 @@ def _run(args: argparse.Namespace) -> int:
         raise UsageError("several sources go with --into DIR, which gets a file of each")
     if args.no_track and args.output is not None and args.output.suffix == ".tum":
         raise UsageError("-o NAME.tum writes a file a track: it does not go with --no-track")
-    from headvox.session import opened
+    from headvox.commands.session import opened
     from headvox.sinks import Sink, open_sink
     from headvox.sinks.jsonl import JsonStream
     from headvox.sinks.summary import summary
@@ -201,8 +203,8 @@ def _run_batch(args: argparse.Namespace) -> int:
         raise UsageError(
             "--into goes with one SOURCE or more, and with none of --json, -o, --view, --strict and --limit"
         )
-    from headvox.batch import Settings, run_batch
-    from headvox.live import Live
+    from headvox.commands.live import Live
+    from headvox.parallel.batch import Settings, run_batch
 
     places = [str(place) for place in (args.source, *args.more)]
     tracker = None if args.no_track else tracker_config_of(args)
@@ -228,8 +230,8 @@ def _how(done: Done) -> str:
 
 
 def _convert(args: argparse.Namespace) -> int:
-    from headvox.convert import convert
-    from headvox.live import Live
+    from headvox.commands.convert import convert
+    from headvox.commands.live import Live
     from headvox.sources import open_source
 
     notes: list[str] = []
@@ -266,7 +268,7 @@ def _info(args: argparse.Namespace) -> int:
 
 def _show_config(args: argparse.Namespace) -> int:
     from headvox.config import to_toml
-    from headvox.read_masks import load_cascade
+    from headvox.masks.read import load_cascade
 
     config = config_of(args)
     load_cascade(config.cascade)  # a wrong name is to be told now, not when the file is used
@@ -279,7 +281,7 @@ def _warmup(args: argparse.Namespace) -> int:
 
     begun = time.perf_counter()
     from headvox.config import DetectorConfig
-    from headvox.read_masks import shipped_cascades
+    from headvox.masks.read import shipped_cascades
     from headvox.warmup import cache_folder, warm_up
 
     rows = []

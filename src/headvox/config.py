@@ -75,7 +75,7 @@ class DetectorConfig:
 
 @dataclass(frozen=True, slots=True)
 class TrackerConfig:
-    """Everything a :class:`~headvox.track.Tracker` can be told."""
+    """Everything a :class:`~headvox.tracking.tracker.Tracker` can be told."""
 
     confirm_hits: int = 2
     """A new head gets an id when it was seen in so many (more, where it scores less than ``strong_score``) ..."""

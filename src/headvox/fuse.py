@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from headvox.data import F32, F64, Cloud
-from headvox.kernels import kernel, rule
+from headvox.machine.kernels import kernel, rule
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import CompiledGate
 from headvox.integral import Integral, box_reach, set_corners, with_margins
-from headvox.kernels import bare_kernel, rule
-from headvox.simd import LANES, add, fill, less, load, lowest, sub, times, within
+from headvox.machine.kernels import bare_kernel, rule
+from headvox.machine.simd import LANES, add, fill, less, load, lowest, sub, times, within
+from headvox.masks.compile import CompiledGate
 
 SLICES = 4
 ALL = np.uint32(0xFFFFFFFF)

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.kernels import bare_kernel, kernel, rule
-from headvox.simd import (
+from headvox.machine.kernels import bare_kernel, kernel, rule
+from headvox.machine.simd import (
     LANES,
     add,
     beginning,

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import SCORE_UNIT
 from headvox.config import DetectorConfig
 from headvox.data import F64, Expected, Frame
-from headvox.masks import Cascade
+from headvox.masks.cascade import Cascade
+from headvox.masks.compile import SCORE_UNIT
 
 I64 = npt.NDArray[np.int64]
 

@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.assemble import MOST_POSES
-from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.data import F64
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
 from headvox.integral import box_reach, room_for, row_for, shape_with_margins
-from headvox.pose import FitMemory
+from headvox.machine.simd import LANES
+from headvox.masks.compile import CompiledCascade, CompiledStages
+from headvox.pose.fit import FitMemory
 from headvox.refine import MOST_PARTS, ROWS
-from headvox.simd import LANES
 from headvox.slabs import Slabs, cut
 from headvox.visibility import cells_of
 from headvox.vote import StageTables, seen_boxes

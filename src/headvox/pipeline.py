@@ -13,8 +13,6 @@ import numpy.typing as npt
 
 from headvox.assemble import MOST_POSES, heads_at, with_poses
 from headvox.check import check_frame, nothing_in_range, origins_of
-from headvox.clock import Clock
-from headvox.compile_masks import SCORE_UNIT, compile_cascade
 from headvox.config import DetectorConfig
 from headvox.cuda.detect import DEVICE_STAGES, OnDevice
 from headvox.cuda.device import BATCH, DeviceLost, use_device
@@ -23,15 +21,17 @@ from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners, shape_with_margins
 from headvox.keep import asks_cameras, keep, least_score, slack_of
-from headvox.kernels import read_only
+from headvox.machine.clock import Clock
+from headvox.machine.kernels import read_only
+from headvox.machine.threads import Threads
+from headvox.masks.compile import SCORE_UNIT, compile_cascade
+from headvox.masks.read import load_cascade
 from headvox.memory import Memory, Stages
 from headvox.placing import Placing
-from headvox.pose import fit_poses
-from headvox.read_masks import load_cascade
+from headvox.pose.fit import fit_poses
 from headvox.refine import fit_spheres
 from headvox.slabs import shares_of
 from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, best_of_each, local_maxima
-from headvox.threads import Threads
 from headvox.visibility import count_states, look_about
 from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import (

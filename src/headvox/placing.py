@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from headvox.check import origins_of
-from headvox.compile_masks import CompiledCascade
 from headvox.config import DetectorConfig
 from headvox.data import F32, DepthImage, Frame, Intrinsics
 from headvox.fuse import Region
+from headvox.masks.compile import CompiledCascade
 from headvox.visibility import camera_table
 from headvox.voxelize import Lattice, Rays
 

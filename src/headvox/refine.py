@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from headvox.cholesky import factor, substitute
-from headvox.kernels import bare_kernel, kernel, rule
+from headvox.machine.cholesky import factor, substitute
+from headvox.machine.kernels import bare_kernel, kernel, rule
 
 REACH_M = 0.16
 BELOW_M = 0.09

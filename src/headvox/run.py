@@ -15,7 +15,7 @@ from headvox.sinks import Result, Sink
 from headvox.sources import Source
 
 if TYPE_CHECKING:
-    from headvox.track import Tracker
+    from headvox.tracking.tracker import Tracker
 
 RECENT = 100_000  # frames that the percentiles look back over: a run may last for weeks
 
@@ -47,7 +47,7 @@ class Report:
     ids: int | None = None
     """How many heads were given an id; None without a tracker."""
     untracked: dict[str, int] = field(default_factory=dict)
-    """Frames whose stamp did not go on, by what was wrong: see :class:`~headvox.track.Tracker`."""
+    """Frames whose stamp did not go on, by what was wrong: see :class:`~headvox.tracking.tracker.Tracker`."""
     seconds: float = 0.0
     """Wall time of the whole loop: reading, detecting, writing."""
     latency_ms: deque[float] = field(default_factory=_recent)

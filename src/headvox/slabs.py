@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from headvox.kernels import rule
+from headvox.machine.kernels import rule
 
 I64 = npt.NDArray[np.int64]
 

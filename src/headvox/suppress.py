@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.data import F64
-from headvox.kernels import kernel
+from headvox.machine.kernels import kernel
 
 I32 = npt.NDArray[np.int32]
 PEAK_REACH = {1: 1, 2: 1, 4: 2}

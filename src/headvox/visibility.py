@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from headvox.data import F32, F64, DepthImage, Intrinsics
 from headvox.frames import inverse
-from headvox.kernels import bare_kernel, kernel, product, read_only, rule
+from headvox.machine.kernels import bare_kernel, kernel, product, read_only, rule
 from headvox.voxelize import Lattice
 
 HIDDEN, EMPTY = 1, 2

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import SCORE_UNIT, CompiledStages, CompiledVotes
 from headvox.integral import Integral, box_reach, place, set_corners, with_margins
-from headvox.kernels import bare_kernel, kernel, product, rule
-from headvox.masks import STATISTICS
-from headvox.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
+from headvox.machine.kernels import bare_kernel, kernel, product, rule
+from headvox.machine.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
+from headvox.masks.cascade import STATISTICS
+from headvox.masks.compile import SCORE_UNIT, CompiledStages, CompiledVotes
 from headvox.slabs import ONE_SLAB, slice_of
 
 DROPPED = -(1 << 40)

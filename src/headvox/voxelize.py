@@ -21,8 +21,8 @@ import numpy.typing as npt
 from headvox.data import F32, F64, I64, U16, Cloud, DepthImage
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
-from headvox.kernels import bare_kernel, rule
-from headvox.simd import (
+from headvox.machine.kernels import bare_kernel, rule
+from headvox.machine.simd import (
     LANES,
     add,
     below,
@@ -45,7 +45,7 @@ from headvox.simd import (
     to_int,
     where,
 )  # fmt: skip
-from headvox.threads import take
+from headvox.machine.threads import take
 
 NOWHERE = np.int32(-1)
 FARTHEST = np.int32(2**31 - 1)

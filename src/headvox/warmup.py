@@ -11,16 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Heads, Intrinsics
 from headvox.gate import gate_columns
+from headvox.machine.threads import Threads, begin
+from headvox.masks.compile import CompiledCascade, CompiledStages
+from headvox.masks.read import load_cascade
 from headvox.pipeline import Detector
-from headvox.pose import FitMemory, fit_poses
-from headvox.read_masks import load_cascade
-from headvox.threads import Threads
-from headvox.track import Tracker
-from headvox.trials import search
+from headvox.pose.fit import FitMemory, fit_poses
+from headvox.pose.trials import search
+from headvox.tracking.identity import price
+from headvox.tracking.tracker import Tracker
 
 _ANYTHING = 1 << 40
 VOXEL_M = 0.025
@@ -93,23 +94,34 @@ def _expected() -> Expected:
 
 
 def _follow() -> None:
-    """Run a tracker over a head that is new, seen again, and looked for."""
+    """Run a tracker over a head that is new, seen again, expected, and looked for."""
     head = Heads(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), np.full(1, 0.1), np.ones(1))
     for _, image in _frames(VOXEL_M):
         tracker = Tracker()
         for k, found in enumerate((head, head, Heads())):
             tracker.update(found, replace(image, stamp_ns=k))
+            tracker.expected(k + 1)
 
 
 def cache_folder() -> Path:
-    """Return the folder where the compiled loops are kept."""
-    return Path(gate_columns.stats.cache_path)  # type: ignore[attr-defined]
+    """Return the folder where the compiled loops of the search are kept; each package has one."""
+    return _folder_of(gate_columns)
+
+
+def kept_loops() -> int:
+    """Return how many compiled loops the disk has, of search, poses and tracks."""
+    folders = {_folder_of(kernel) for kernel in (gate_columns, search, price, begin)}
+    return sum(1 for folder in folders for _ in folder.glob("*.nbc"))
+
+
+def _folder_of(kernel: Any) -> Path:
+    return Path(kernel.stats.cache_path)
 
 
 def _is_kept(kernel: Any) -> bool:
     """Whether the disk has some version of a compiled loop."""
     name = f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}-*"
-    return any(cache_folder().glob(name))
+    return any(_folder_of(kernel).glob(name))
 
 
 def _open(cascade: CompiledCascade) -> CompiledCascade:

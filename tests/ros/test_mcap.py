@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from headvox.commands.convert import convert
 from headvox.config import DetectorConfig
-from headvox.convert import convert
 from headvox.data import BadFrame, Cloud, DepthImage, Frame, Heads, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.pipeline import Detector
@@ -18,7 +18,7 @@ from headvox.run import run
 from headvox.sinks import Result, open_sink
 from headvox.sources import open_source
 from headvox.synth import mannequin, presets, record
-from headvox.track import Tracker
+from headvox.tracking.tracker import Tracker
 
 STAMP = 1_700_000_000_123_456_789
 POINTS = np.random.default_rng(0).uniform(-2, 2, (50, 3)).astype(np.float32)

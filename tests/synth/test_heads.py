@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from headvox.errors import HeadvoxError
+from headvox.parallel.workers import Workers
 from headvox.synth.heads import EYE_DISTANCE_M, RANGES, make_heads, make_shell, ply_bytes, sample_identities
-from headvox.workers import Workers
 
 
 def digest(folder) -> str:

@@ -7,9 +7,9 @@ from PIL import Image
 
 from headvox.data import Frame
 from headvox.errors import HeadvoxError
+from headvox.parallel.workers import Workers
 from headvox.sources import open_source
 from headvox.synth import mannequin, presets, record
-from headvox.workers import Workers
 
 STAMPS = record.stamps(3, 10.0)
 

@@ -17,10 +17,10 @@ from visualization_msgs.msg import MarkerArray
 from headvox.config import DetectorConfig, TrackerConfig
 from headvox.data import Frame
 from headvox.errors import HeadvoxError
+from headvox.masks.read import load_cascade
 from headvox.pipeline import Detector
-from headvox.read_masks import load_cascade
 from headvox.ros import outputs
-from headvox.track import Tracker
+from headvox.tracking.tracker import Tracker
 from headvox.warmup import warm_up
 from headvox_ros.as_message import as_message
 from headvox_ros.node import SensorNode, run

@@ -14,7 +14,7 @@ from tf2_msgs.msg import TFMessage
 
 from headvox.data import Cloud, DepthImage, Frame
 from headvox.errors import HeadvoxError
-from headvox.latest import Latest
+from headvox.machine.latest import Latest
 from headvox.ros.messages import cloud_points, depth_image, intrinsics, stamp_ns
 from headvox.ros.synchronise import NS, Reading, Synchroniser
 from headvox.ros.transforms import NoTransform, TransformBuffer, set_from

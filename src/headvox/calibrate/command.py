@@ -13,10 +13,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from headvox.atomic import write_text
+from headvox.commands.flags import (
+    GOOD,
+    add_source_options,
+    keep_input,
+    place,
+    source_options_of,
+    whole_number,
+)
+from headvox.commands.live import Live
+from headvox.commands.table import printable, table
 from headvox.errors import HeadvoxError
-from headvox.flags import GOOD, add_source_options, keep_input, place, source_options_of, whole_number
-from headvox.live import Live
-from headvox.table import printable, table
 
 if TYPE_CHECKING:
     from headvox.calibrate.floor import Floor

@@ -13,7 +13,8 @@ import numpy as np
 from numba import cuda
 
 from headvox import __version__
-from headvox.bench_input import describe_machine, make_input
+from headvox.bench.input import describe_machine, make_input
+from headvox.commands.table import table
 from headvox.config import DetectorConfig
 from headvox.cuda import gate
 from headvox.cuda.device import BATCH
@@ -21,7 +22,6 @@ from headvox.cuda.search import Search
 from headvox.data import DepthImage, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.pipeline import Detector
-from headvox.table import table
 
 Values = dict[str, Any]
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 from headvox.assemble import stated, with_poses
 from headvox.check import check_frame, nothing_in_range
-from headvox.clock import Clock
-from headvox.compile_masks import CompiledCascade
 from headvox.config import DetectorConfig
 from headvox.cuda.device import Device
 from headvox.cuda.readings import Asked, Found
 from headvox.data import Expected, Frame, Heads
 from headvox.keep import asks_cameras, least_score, slack_of
+from headvox.machine.clock import Clock
+from headvox.masks.compile import CompiledCascade
 from headvox.placing import Placing
 from headvox.suppress import AROUND, MOST_PEAKS
 from headvox.voxelize import Lattice

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import CompiledCascade
 from headvox.cuda.readings import Asked, Found
 from headvox.data import DepthImage
 from headvox.errors import HeadvoxError
+from headvox.masks.compile import CompiledCascade
 from headvox.voxelize import Lattice, Rays
 
 if TYPE_CHECKING:

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import cuda
 
-from headvox.align import PARAMETERS, STATE, TOLD
 from headvox.assemble import MOST_POSES, SAME_HEAD_M
 from headvox.cuda import nearby, pose, refine
 from headvox.cuda.lanes import SIMULATED
-from headvox.nearby import MOST_SAMPLES, RAY, SAMPLE
-from headvox.pose import Poses, all_turns, upright_turns
-from headvox.refine import cells_about
-from headvox.settle import Refined
-from headvox.template import load_template
-from headvox.trials import (
+from headvox.pose.align import PARAMETERS, STATE, TOLD
+from headvox.pose.fit import Poses, all_turns, upright_turns
+from headvox.pose.nearby import MOST_SAMPLES, RAY, SAMPLE
+from headvox.pose.settle import Refined
+from headvox.pose.template import load_template
+from headvox.pose.trials import (
     COARSE_SAMPLES,
     FINE_RAYS,
     FINE_SAMPLES,
@@ -25,6 +24,7 @@ from headvox.trials import (
     POLISH_RAYS,
     POLISH_SAMPLES,
 )
+from headvox.refine import cells_about
 
 if TYPE_CHECKING:
     from headvox.cuda.search import Search

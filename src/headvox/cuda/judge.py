@@ -22,7 +22,7 @@ from headvox.cuda.readings import (
 )
 from headvox.cuda.suppress import CANDIDATES, HEADS, JUDGED, PEAKS
 from headvox.data import F64
-from headvox.pose import Poses
+from headvox.pose.fit import Poses
 from headvox.visibility import EMPTY, HIDDEN, pixel_of, project, state_at
 from headvox.vote import DROPPED
 

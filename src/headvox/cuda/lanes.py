@@ -1,8 +1,8 @@
 """How a loop is compiled for the device, and what a rule of the CPU means there: a lane is a thread.
 
-The CPU's rules are written in operations on lanes (:mod:`headvox.simd`). On the device each of these is an operation
-on one number, so that the same source says what is computed, here and there. Numba's simulator runs plain Python
-functions, one thread after the other.
+The CPU's rules are written in operations on lanes (:mod:`headvox.machine.simd`). On the device each of these is an
+operation on one number, so that the same source says what is computed, here and there. Numba's simulator runs plain
+Python functions, one thread after the other.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ LANE_WISE = {
     "smaller": smaller,
     "larger": larger,
 }
-"""Names of :mod:`headvox.simd`, and what they are on the device."""
+"""Names of :mod:`headvox.machine.simd`, and what they are on the device."""
 
 sum_about_voxel = on_device(sum_about, box_sum=on_device(box_sum))
 """The sum over a box about a voxel, cut off at the edges of the integral volume: it needs no margins."""

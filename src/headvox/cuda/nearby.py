@@ -29,7 +29,7 @@ from headvox.cuda.readings import (
     WIDTH,
 )
 from headvox.cuda.suppress import HEADS
-from headvox.nearby import (
+from headvox.pose.nearby import (
     FAR,
     MOST_PIXELS,
     MOST_SAMPLES,
@@ -47,8 +47,8 @@ from headvox.nearby import (
     window,
     window_of,
 )
-from headvox.settle import expect_turns
-from headvox.trials import (
+from headvox.pose.settle import expect_turns
+from headvox.pose.trials import (
     COARSE_SAMPLES,
     FINE_RAYS,
     FINE_SAMPLES,
@@ -90,7 +90,7 @@ def place_of(number, there, room):  # type: ignore[no-untyped-def]
     """Return where the reading of this ``number``, from 1, of all that are ``there`` is kept; -1 where it is not.
 
     A list with ``room`` for so many is thinned whenever it is full, and from then on takes every second of what it took
-    before: see :func:`headvox.nearby.gather_points`.
+    before: see :func:`headvox.pose.nearby.gather_points`.
     """
     rounds, mine = 0, 0
     while first_of_round(rounds + 1, room) <= there:

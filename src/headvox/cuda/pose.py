@@ -1,8 +1,8 @@
 """The pose fit: all starts of all heads at once, each refined to its end; what is best of them is asked afterwards.
 
 On the CPU a start is refined only when those before it were, and are not the same. Here there are threads for all of
-them, and :mod:`headvox.settle` chooses as it does there. A block takes a start; its threads share out the points, and
-what they add up is added in an order that is always the same.
+them, and :mod:`headvox.pose.settle` chooses as it does there. A block takes a start; its threads share out the points,
+and what they add up is added in an order that is always the same.
 """
 
 from __future__ import annotations
@@ -12,7 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import cuda
 
-from headvox.align import (
+from headvox.assemble import MOST_POSES
+from headvox.cuda.blocks import share_of, sum_rows
+from headvox.cuda.lanes import MATH, device, kernel, on_device, wait_for_block
+from headvox.cuda.nearby import RAYS, ROUND, SAMPLES
+from headvox.cuda.suppress import HEADS
+from headvox.machine.cholesky import substitute
+from headvox.pose.align import (
     EVIDENCE,
     PARAMETERS,
     RESIDUAL,
@@ -28,15 +34,9 @@ from headvox.align import (
     weigh,
     weight_of_each,
 )
-from headvox.assemble import MOST_POSES
-from headvox.cholesky import substitute
-from headvox.cuda.blocks import share_of, sum_rows
-from headvox.cuda.lanes import MATH, device, kernel, on_device, wait_for_block
-from headvox.cuda.nearby import RAYS, ROUND, SAMPLES
-from headvox.cuda.suppress import HEADS
-from headvox.settle import Refined, assess, column, odds, quaternion_of, settle, turn_between
-from headvox.template import FINE_MODES, MODES
-from headvox.trials import (
+from headvox.pose.settle import Refined, assess, column, odds, quaternion_of, settle, turn_between
+from headvox.pose.template import FINE_MODES, MODES
+from headvox.pose.trials import (
     COARSE_K,
     COARSE_MODES,
     COARSE_SAMPLES,
@@ -87,7 +87,7 @@ class Starts(NamedTuple):
 def factor(A, size, thread, threads):  # type: ignore[no-untyped-def]
     """Leave the Cholesky factor in the lower half of A, and what solves L x = -(column RESIDUAL) in its last row.
 
-    All threads of a block call this: as :func:`headvox.align.solve`, a column at a time.
+    All threads of a block call this: as :func:`headvox.pose.align.solve`, a column at a time.
     """
     for j in range(size):
         wait_for_block()
@@ -140,7 +140,7 @@ def accumulate(J, count, size, A, thread, threads):  # type: ignore[no-untyped-d
 def linearise(  # type: ignore[no-untyped-def]
     points, first, n, rays, m, modes, k, upright, template, state, J, A, told, costs, thread, threads
 ):
-    """As :func:`headvox.align.linearise`, by all threads of a block, of ``n`` points from the ``first`` on."""
+    """As :func:`headvox.pose.align.linearise`, by all threads of a block, of ``n`` points from the ``first`` on."""
     a, b = share_of(n, thread, threads)
     c, d = share_of(m, thread, threads)
     mine = J[:, a + c : b + d]
@@ -232,7 +232,7 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
 
 @device
 def choose_refined(costs, coarse, fine, told, points, count, picked, refined):  # type: ignore[no-untyped-def]
-    """Copy what :func:`headvox.trials.search` would refine of ``count`` starts to ``refined``; return how many.
+    """Copy what :func:`headvox.pose.trials.search` would refine of ``count`` starts to ``refined``; return how many.
 
     ``points`` is how many they were fitted to. All starts are refined; the first is what is expected, if anything is.
     ``picked`` is working memory.

@@ -24,8 +24,8 @@ import numpy.typing as npt
 
 from headvox.check import origins_of
 from headvox.data import F64, DepthImage, Expected, Frame
-from headvox.nearby import lens_of
-from headvox.pose import Poses
+from headvox.pose.fit import Poses
+from headvox.pose.nearby import lens_of
 from headvox.visibility import camera_table
 from headvox.voxelize import Lattice, Rays, part_transform
 
@@ -97,7 +97,7 @@ def words_of(asked: Asked) -> int:
 def pack(asked: Asked, rays_of: Callable[[DepthImage, Lattice], Rays], row: I32) -> None:
     """Write everything about a frame to ``row``, which is long enough: see :func:`words_of`.
 
-    Images come before clouds, as in :func:`headvox.nearby.sensors_of`.
+    Images come before clouds, as in :func:`headvox.pose.nearby.sensors_of`.
     """
     frame, lattice = asked.frame, asked.lattice
     real, wide, half = row.view(np.float32), row.view(np.float64), row.view(np.uint16)

@@ -9,12 +9,12 @@ import numpy as np
 from numba import cuda
 
 from headvox.assemble import RADIUS_M as UNFITTED_M
-from headvox.cholesky import factor, substitute
 from headvox.cuda.blocks import sum_rows
 from headvox.cuda.gate import cell_of
 from headvox.cuda.lanes import MATH, device, kernel, on_device, product_64
 from headvox.cuda.readings import EXPECTED, EXPECTED_AT, HAIRED, LEAST, ORIGIN, THRESHOLD
 from headvox.cuda.suppress import HEADS, JUDGED, KEPT
+from headvox.machine.cholesky import factor, substitute
 from headvox.refine import (
     HAIR_M,
     RADIUS,

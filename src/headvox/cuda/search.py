@@ -16,7 +16,6 @@ import numpy.typing as npt
 from numba import cuda
 
 from headvox.assemble import MOST_POSES
-from headvox.compile_masks import CompiledCascade, CompiledStages
 from headvox.cuda import compact, gate, integral, judge, suppress, vote, voxelize
 from headvox.cuda.fits import Fits
 from headvox.cuda.graph import capture
@@ -24,6 +23,7 @@ from headvox.cuda.lanes import SIMULATED
 from headvox.cuda.readings import OCTET, Asked, Found, pack, words_of
 from headvox.data import DepthImage
 from headvox.gate import gate_tables
+from headvox.masks.compile import CompiledCascade, CompiledStages
 from headvox.suppress import PEAK_REACH
 from headvox.visibility import cells_of
 from headvox.vote import seen_boxes

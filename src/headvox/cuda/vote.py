@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import cuda
 
-from headvox.compile_masks import CompiledStages, CompiledVotes
 from headvox.cuda.blocks import sum_of_all
 from headvox.cuda.gate import cell_of
 from headvox.cuda.lanes import LANE_WISE, device, kernel, on_device, product_64, sum_about_voxel
 from headvox.cuda.readings import SEES
+from headvox.masks.compile import CompiledStages, CompiledVotes
 from headvox.vote import DROPPED, FEATURES_PER_GROUP, StageTables, order, rank, statistics_of, votes_at
 
 MOST_THREADS = 256  # of a block; a power of two
@@ -52,7 +52,7 @@ def votes_table(votes: CompiledVotes) -> tuple[npt.NDArray[Any], ...]:
 
 @device
 def leaf_of(tree, root, depth, nodes, features):  # type: ignore[no-untyped-def]
-    """Return the leaf that a tree leads to, see :class:`headvox.compile_masks.CompiledStages`."""
+    """Return the leaf that a tree leads to, see :class:`headvox.masks.compile.CompiledStages`."""
     at = root[tree]
     for _ in range(depth[tree]):
         at = nodes[at + 2] if features[nodes[at]] <= nodes[at + 1] else nodes[at + 3]

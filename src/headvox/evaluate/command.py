@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from headvox import __version__
-from headvox.flags import (
+from headvox.commands.flags import (
     GOOD,
     LIMIT_MISSED,
     UsageError,
@@ -25,10 +25,10 @@ from headvox.flags import (
     tracker_config_of,
     whole_number,
 )
-from headvox.live import Live
+from headvox.commands.live import Live
+from headvox.commands.table import file_name, printable
+from headvox.parallel.workers import Workers, add_flags, of_flags
 from headvox.sample import sample_folder
-from headvox.table import file_name, printable
-from headvox.workers import Workers, add_flags, of_flags
 
 if TYPE_CHECKING:
     from headvox.evaluate.match import Rules
@@ -205,7 +205,7 @@ def _made(plan: Plan, args: argparse.Namespace) -> dict[str, Any]:
     import numba
     import numpy
 
-    from headvox.read_masks import load_cascade
+    from headvox.masks.read import load_cascade
 
     made = {
         "headvox": __version__,

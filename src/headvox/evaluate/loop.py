@@ -17,10 +17,10 @@ from headvox.evaluate.match import Rules, match
 from headvox.evaluate.metrics import Sample, counted
 from headvox.evaluate.scenarios import Scenario
 from headvox.evaluate.truth import NO_ID, Bools, TrueHeads
+from headvox.masks.read import load_cascade
 from headvox.pipeline import Detector
-from headvox.read_masks import load_cascade
 from headvox.run import look
-from headvox.track import Tracker
+from headvox.tracking.tracker import Tracker
 from headvox.warmup import warm_up
 
 LOWEST_SCORE = -100.0

@@ -16,7 +16,7 @@ from headvox.evaluate.loop import Finder, Run, bare, go_over, tracked, written
 from headvox.evaluate.match import Rules
 from headvox.evaluate.scenarios import Scenario
 from headvox.evaluate.scores import Scores, score
-from headvox.workers import Workers
+from headvox.parallel.workers import Workers
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from headvox.atomic import write_text
+from headvox.commands.table import table
 from headvox.errors import HeadvoxError
 from headvox.evaluate.metrics import Group
 from headvox.evaluate.scores import LESS, MORE, Scores
-from headvox.table import table
 
 FORMAT, VERSION = "headvox-evaluation", 1
 

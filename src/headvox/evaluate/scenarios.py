@@ -16,7 +16,7 @@ from headvox.data import F64, BadFrame, Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.evaluate.match import Rules
 from headvox.evaluate.truth import FILE, TrueHeads, read_truth
-from headvox.workers import ALONE, Workers
+from headvox.parallel.workers import ALONE, Workers
 
 if TYPE_CHECKING:
     from headvox.synth.scene import TrueHead

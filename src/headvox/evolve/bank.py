@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import voxel_box
 from headvox.integral import Integral, sum_about
-from headvox.kernels import kernel
-from headvox.masks import CHANNELS, STATISTICS, Box, Group, ring, statistics
+from headvox.machine.kernels import kernel
+from headvox.masks.cascade import CHANNELS, STATISTICS, Box, Group, ring, statistics
+from headvox.masks.compile import voxel_box
 
 VOXEL_M, SUBDIVISION = 0.05, 2
 

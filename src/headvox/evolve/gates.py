@@ -16,7 +16,7 @@ from headvox.data import F64
 from headvox.errors import HeadvoxError
 from headvox.evolve.bank import GATE
 from headvox.evolve.samples import I64, GateSums
-from headvox.masks import Condition
+from headvox.masks.cascade import Condition
 
 LOST_COST = 30.0
 GENERATIONS = 400

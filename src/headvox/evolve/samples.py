@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import SCORE_UNIT, CompiledGate, CompiledStages
 from headvox.data import F64, Frame
 from headvox.evolve.bank import GATE, OCCUPIED, SEEN, SUBDIVISION, VOXEL_M, sums_about
 from headvox.evolve.views import View
 from headvox.fuse import Region
 from headvox.gate import pass_gate
 from headvox.integral import integral_volume
-from headvox.masks import CHANNELS
+from headvox.masks.cascade import CHANNELS
+from headvox.masks.compile import SCORE_UNIT, CompiledGate, CompiledStages
 from headvox.suppress import PEAK_REACH, suppress
 from headvox.visibility import count_seen
 from headvox.vote import DROPPED, score_by_stages

@@ -16,7 +16,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from headvox.compile_masks import CompiledCascade, CompiledGate, compile_cascade
 from headvox.errors import HeadvoxError
 from headvox.evolve import boost, gates
 from headvox.evolve.bank import SUBDIVISION, VOXEL_M
@@ -33,9 +32,10 @@ from headvox.evolve.samples import (
 )
 from headvox.evolve.views import View, keep_view
 from headvox.evolve.write import Found, cascade_text, write_cascade
-from headvox.masks import Cascade, Condition
-from headvox.read_masks import parse_cascade
-from headvox.workers import ALONE, Workers
+from headvox.masks.cascade import Cascade, Condition
+from headvox.masks.compile import CompiledCascade, CompiledGate, compile_cascade
+from headvox.masks.read import parse_cascade
+from headvox.parallel.workers import ALONE, Workers
 
 GATE_VIEWS = 3000
 GATE_LOSES, TIGHT_GATE_LOSES = 0.03, 0.004

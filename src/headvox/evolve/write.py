@@ -12,7 +12,7 @@ from typing import Any
 from headvox.atomic import write_text
 from headvox.evolve.bank import OCCUPIED, SEEN, SUBDIVISION, VOXEL_M
 from headvox.evolve.boost import Fitted
-from headvox.masks import Condition, Group
+from headvox.masks.cascade import Condition, Group
 
 WHY = {
     "crown": "the upper half is there", "beside": "about the crown there is less than in it",

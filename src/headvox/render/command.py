@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from headvox.flags import (
+from headvox.commands.flags import (
     GOOD,
     INTERRUPTED,
     UsageError,
@@ -19,8 +19,8 @@ from headvox.flags import (
 )
 
 if TYPE_CHECKING:
+    from headvox.commands.flags import Commands
     from headvox.data import Frame
-    from headvox.flags import Commands
     from headvox.sinks import Result
 
 SUFFIXES = (".gif", ".mp4", ".png")
@@ -70,11 +70,11 @@ def _render(args: argparse.Namespace) -> int:
         if args.limit is not None:
             raise UsageError("--at and --limit both say where to stop: give one of them")
         args.limit = args.at + 1
+    from headvox.commands.session import opened
+    from headvox.commands.table import printable
     from headvox.errors import HeadvoxError
     from headvox.render.film import open_film
     from headvox.render.sheet import Sheets
-    from headvox.session import opened
-    from headvox.table import printable
 
     with opened(args) as session:
         keep_input(args.output, session.inputs)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from headvox.commands.table import table
 from headvox.data import Heads
 from headvox.run import Report
-from headvox.table import table
 
 PERCENTILES = (50, 95, 99)
 _CLOCK = {

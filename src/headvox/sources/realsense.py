@@ -13,7 +13,7 @@ import numpy as np
 
 from headvox.data import F64, BadFrame, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError, Undecided
-from headvox.latest import Latest
+from headvox.machine.latest import Latest
 from headvox.ros.synchronise import Reading, Synchroniser
 from headvox.sources.extrinsics import read_extrinsics
 from headvox.sources.options import ASSUMED, SourceOptions, assumed_mount, mounted

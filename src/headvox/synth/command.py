@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from headvox.live import Live
-from headvox.table import printable, table
-from headvox.workers import add_flags, of_flags
+from headvox.commands.live import Live
+from headvox.commands.table import printable, table
+from headvox.parallel.workers import add_flags, of_flags
 
 if TYPE_CHECKING:
     from headvox.synth.scene import Scene

@@ -23,6 +23,7 @@ from scipy.stats import qmc
 
 from headvox.data import F64, Intrinsics
 from headvox.errors import HeadvoxError
+from headvox.parallel.workers import ALONE, Workers
 from headvox.synth.bodies import (
     I32,
     Mask,
@@ -34,7 +35,6 @@ from headvox.synth.bodies import (
 )
 from headvox.synth.rays import NOTHING, Mesh, look
 from headvox.synth.spread import escapes, spread_points
-from headvox.workers import ALONE, Workers
 
 EYE_DISTANCE_M = 0.064  # of a normalised head
 RANGES = {"age_years": (8.0, 80.0), "sex": (0.0, 1.0), "mass": (0.15, 0.9), "elongation": (-1.0, 1.0)}

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from headvox.data import F32, F64, Intrinsics
 from headvox.frames import inverse, transform
-from headvox.kernels import kernel
+from headvox.machine.kernels import kernel
 
 I32 = npt.NDArray[np.int32]
 

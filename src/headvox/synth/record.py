@@ -24,12 +24,12 @@ from headvox import __version__
 from headvox.atomic import write_text
 from headvox.data import U16, Cloud, Frame
 from headvox.errors import HeadvoxError
+from headvox.parallel.workers import ALONE, Workers
 from headvox.sources.folder import FRAME_NS
 from headvox.synth.actors import People
 from headvox.synth.camera import d435i
 from headvox.synth.presets import two_cameras
 from headvox.synth.scene import Scene, TrueHead
-from headvox.workers import ALONE, Workers
 
 SAMPLE_FRAMES = 24
 SAMPLE_RATE_HZ = 10.0

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from headvox.data import F64, I64
 from headvox.errors import HeadvoxError
-from headvox.kernels import kernel
+from headvox.machine.kernels import kernel
 
 I32 = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from headvox.flags import (
+from headvox.commands.flags import (
     GOOD,
     INTERRUPTED,
     add_command,
@@ -17,7 +17,7 @@ from headvox.flags import (
 )
 
 if TYPE_CHECKING:
-    from headvox.flags import Commands
+    from headvox.commands.flags import Commands
 
 
 def add_to(commands: Commands) -> None:
@@ -46,7 +46,7 @@ def rrd_file(text: str) -> Path:
 def _view(args: argparse.Namespace) -> int:
     from contextlib import closing
 
-    from headvox.session import opened
+    from headvox.commands.session import opened
     from headvox.sinks.summary import summary
     from headvox.view.watch import Watch, check
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from conftest import NS, START_S
 
+from headvox.parallel.workers import Workers
 from headvox.synth.camera import d435i
 from headvox.synth.presets import two_cameras
 from headvox.synth.record import stamps, write_recording
-from headvox.workers import Workers
 from headvox_ros.scenario import play, report
 
 FRAMES, LOOPS = 12, 2

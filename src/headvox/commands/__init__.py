@@ -1,0 +1,1 @@
+"""The smaller commands, and what all commands share."""

@@ -1,0 +1,1 @@
+"""Masks as data: what a cascade file says, its reader, its compiler, and its description in words and pictures."""

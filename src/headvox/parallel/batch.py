@@ -1,0 +1,132 @@
+"""Many recordings: each is one piece of work, and leaves one file. What is there already is not done again."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from headvox.config import DetectorConfig, TrackerConfig
+from headvox.errors import HeadvoxError
+from headvox.parallel.workers import Workers
+from headvox.sinks import Result, Sink
+from headvox.sources.options import SourceOptions
+
+SUFFIX = ".jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What every source is opened and run with, and the folder for the results; no tracker: bare detections."""
+
+    into: Path
+    detector: DetectorConfig
+    options: SourceOptions
+    tracker: TrackerConfig | None
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What came of one recording: how much there was, and ``failure``, one line, if it could not be used."""
+
+    name: str
+    frames: int = 0
+    bad: int = 0
+    heads: int = 0
+    was_there: bool = False
+    failure: str = ""
+
+
+def run_batch(
+    places: Sequence[str], settings: Settings, workers: Workers, on_done: Callable[[Done], None]
+) -> list[Done]:
+    """Run the detector over each of ``places``, paths or addresses; write NAME.jsonl of each into the folder.
+
+    Lines are those of ``headvox run --json``, but for ``latency_ms``, which is null: the files are the same bytes
+    whoever does the work. A file appears when its recording is done. ``on_done`` is told of each, in order.
+
+    Raises:
+        HeadvoxError: two of the same name, or a folder that cannot be made.
+    """
+    names = [name_of(place) for place in places]
+    for name in names:
+        if names.count(name) > 1:
+            raise HeadvoxError(
+                f"Two of the sources are called {name}: their results would be one file.",
+                "Run them into folders of their own.",
+            )
+    try:
+        settings.into.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HeadvoxError(f"{settings.into}: {error.strerror}.", "Choose another folder.") from None
+    settings = replace(settings, into=settings.into.absolute())
+    every = []
+    for done in workers.map(partial(run_one, settings=settings), [_absolute(place) for place in places]):
+        on_done(done)
+        every.append(done)
+    return every
+
+
+def name_of(place: str) -> str:
+    """Return what a recording is called: the last part of its path."""
+    return Path(place.rstrip("/")).name.removesuffix(".mcap").removesuffix(".bag")
+
+
+def _absolute(place: str) -> str:
+    from headvox.sources.remote import is_remote
+
+    return place if is_remote(place) else str(Path(place).absolute())
+
+
+def run_one(place: str, settings: Settings) -> Done:
+    """Run over one recording, unless its file is there."""
+    name = name_of(place)
+    target = settings.into / f"{name}{SUFFIX}"
+    if target.exists():
+        return Done(name, was_there=True)
+    part = target.with_name(f"{target.name}.{os.getpid()}.part")
+    try:
+        done = _run(place, name, part, settings)
+    except HeadvoxError as error:
+        part.unlink(missing_ok=True)
+        return Done(name, failure=str(error))
+    os.replace(part, target)
+    return done
+
+
+def _run(place: str, name: str, part: Path, settings: Settings) -> Done:
+    from headvox.pipeline import Detector
+    from headvox.run import run
+    from headvox.sinks.jsonl import JsonFile
+    from headvox.sources import open_source
+    from headvox.sources.remote import fetched
+    from headvox.tracking.tracker import Tracker
+
+    with (
+        fetched(place) as path,
+        closing(open_source(path, settings.options)) as source,
+        closing(Detector(settings.detector)) as detector,
+        closing(_Untimed(JsonFile(part))) as sink,
+    ):
+        tracker = None if settings.tracker is None else Tracker(settings.tracker)
+        report = run(source, detector, [sink], tracker=tracker)
+    if report.interrupted:
+        raise KeyboardInterrupt
+    return Done(name, report.frames, report.bad, report.heads)
+
+
+class _Untimed:
+    """Leaves the time that a frame took out of what is written."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+
+    def write(self, result: Result) -> None:
+        self._sink.write(replace(result, latency_ms=math.nan))
+
+    def close(self) -> None:
+        self._sink.close()

@@ -67,13 +67,15 @@ def correct_place(x, P, weight, centre, R):
     return np.array([m for m, _ in done]), np.array([C for _, C in done]), after
 
 
-def predict_turn(q, rate, C, dt, density):
-    """Return orientation and covariance ``dt`` later."""
-    step = Rotation.from_rotvec(rate * dt)
+def predict_turn(q, rate, C, dt, density, fade_s):
+    """Return orientation, turn rate and covariance ``dt`` later."""
+    F = slowing(dt, np.full(3, fade_s))
+    step = Rotation.from_rotvec(F[:3, 3:] @ rate)
     axes = np.eye(6)
     axes[:3, :3] = step.as_matrix().T  # the small turn, told in the axes of the head as it stands then
-    F = transition(dt) @ axes
-    return (Rotation.from_quat(q) * step).as_quat(), F @ C @ F.T + white_noise(dt, density)
+    F_axes = F @ axes
+    C = F_axes @ C @ F_axes.T + white_noise(dt, density)
+    return (Rotation.from_quat(q) * step).as_quat(), F[3:, 3:] @ rate, C
 
 
 def correct_turn(q, rate, C, measured, R):

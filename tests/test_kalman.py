@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from headvox.config import TrackerConfig
 from headvox.tracking import kalman
 from headvox.tracking.roster import blank
+from headvox.tracking.tracker import TURN_FADE_S
 
 TIGHT = {"rtol": 1e-9, "atol": 1e-12}
 PLACE_NOISE, TURN_NOISE = np.array([0.8, 0.7, 0.1]), np.array([3.0, 2.0, 4.0])
 FADE_S = np.array([2.0, 2.0, 0.3])
+TURN_DENSITY = np.radians(TrackerConfig().turn_change_deg_s) ** 2
+FOREVER_S = 1e6
 ONE = np.zeros(1, np.int64)
 SEEN, UNSEEN = 0, 1  # at the stamp before: rows are blank, so seen at 0
 
@@ -43,7 +47,7 @@ def test_prediction_equals_matrix_algebra(dt):
     was = now.copy()
     motion = dt, 1.0, 2.0, 1e-6, PLACE_NOISE, FADE_S
     kalman.predict_places(now, SEEN, *motion)
-    kalman.predict_turns(now, dt, TURN_NOISE)
+    kalman.predict_turns(now, dt, TURN_NOISE, TURN_FADE_S)
     for n in range(len(now)):
         x, P, weight = naive.predict_place(
             was["x"][n], was["P"][n], was["weights"][n], seen[n], *motion, kalman.STILL_SPEED_M_S
@@ -51,10 +55,10 @@ def test_prediction_equals_matrix_algebra(dt):
         np.testing.assert_allclose(now["x"][n], x, **TIGHT)
         np.testing.assert_allclose(now["P"][n], P, **TIGHT)
         np.testing.assert_allclose(now["weights"][n], weight, **TIGHT)
-        q, C = naive.predict_turn(was["q"][n], was["rate"][n], was["C"][n], dt, TURN_NOISE)
+        q, rate, C = naive.predict_turn(was["q"][n], was["rate"][n], was["C"][n], dt, TURN_NOISE, TURN_FADE_S)
+        np.testing.assert_allclose(now["rate"][n], rate, **TIGHT)
         np.testing.assert_allclose(now["q"][n] * np.sign(now["q"][n] @ q), q, **TIGHT)
         np.testing.assert_allclose(now["C"][n], C, **TIGHT)
-    np.testing.assert_array_equal(now["rate"], was["rate"])
     np.testing.assert_array_equal(now["P"], np.swapaxes(now["P"], 2, 3))
 
 
@@ -156,11 +160,11 @@ def test_what_is_not_seen_stays_where_it_was_or_goes_on_ever_slower():
     assert 0.1 < roster["x"][0, kalman.MOVING, 0] < FADE_S[0] * (1.0 - np.exp(-3.0 / FADE_S[0]))
 
 
-def follow_turns(orientations, gate=16.3, sigma=0.1, dt=0.1):
+def follow_turns(orientations, fade_s=TURN_FADE_S, gate=16.3, sigma=0.1, dt=0.1):
     roster = blank(1)
     roster["q"][:] = np.nan
     for q in orientations:
-        kalman.predict_turns(roster, dt, np.full(3, 4.0))
+        kalman.predict_turns(roster, dt, np.full(3, TURN_DENSITY), fade_s)
         kalman.correct_turns(roster, ONE, ONE, q[None], sigma**2 * np.eye(3)[None], gate)
     return roster
 
@@ -169,16 +173,34 @@ def yaws(degrees):
     return Rotation.from_rotvec(np.radians(degrees)[:, None] * [0.0, 0.0, 1.0]).as_quat()
 
 
+def yaw_of(row):
+    """Return the yaw of a roster's only row, degrees from -180."""
+    return Rotation.from_quat(row["q"][0]).as_euler("ZYX", degrees=True)[0]
+
+
 def test_orientation_begins_when_it_is_known_and_follows_a_turn():
     unknown = np.full((3, 4), np.nan)
     assert np.isnan(follow_turns(unknown)["q"]).all()
     turning = yaws(np.arange(0.0, 240.0, 6.0))  # 60 degrees a second, past where quaternions change sign
-    row = follow_turns(np.concatenate([unknown, turning, unknown[:1]]))
-    yaw = Rotation.from_quat(row["q"][0]).as_euler("ZYX", degrees=True)[0]
-    assert (yaw - 240.0 + 180.0) % 360.0 - 180.0 == pytest.approx(
-        0.0, abs=2.0
-    )  # foretold by a tenth of a second
+    path = np.concatenate([unknown, turning, unknown[:1]])
+    row = follow_turns(path, fade_s=FOREVER_S)
+    # foretold by a tenth of a second
+    assert (yaw_of(row) - 240.0 + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=2.0)
     assert np.degrees(row["rate"][0]) == pytest.approx([0.0, 0.0, 60.0], abs=3.0)
+    row = follow_turns(path)  # and a little behind, where turns are taken to fade
+    assert -5.0 < (yaw_of(row) - 240.0 + 180.0) % 360.0 - 180.0 < 0.0
+    assert 30.0 < np.degrees(row["rate"][0, 2]) < 60.0
+
+
+def test_a_track_that_was_led_astray_is_put_right_and_does_not_spin():
+    astray = np.cumsum([0.0, 5, 20, 10, 20, 30, 20, 20, 20, 40, 10])
+    path = yaws(np.concatenate([astray, np.zeros(24)]))
+    right = [abs(yaw_of(follow_turns(path[: len(astray) + k]))) < 10.0 for k in range(1, 25)]
+    assert right == [False] * (kalman.REJECTED_BEFORE_RESET - 1) + [True] * (
+        25 - kalman.REJECTED_BEFORE_RESET
+    )
+    spinning = follow_turns(path, fade_s=FOREVER_S)  # what happens where a turn does not fade
+    assert np.degrees(spinning["rate"][0, 2]) == pytest.approx(1200.0, abs=10.0)
 
 
 def test_a_flip_is_left_out_and_believed_when_it_stays():

@@ -6,7 +6,8 @@ white acceleration. The weight of each follows from how well it foretold what wa
 smoothed hard, and one that sets off is followed at once.
 
 Orientation: an error-state (multiplicative) Kalman filter. The state is a quaternion q, world from head, and the turn
-rate in head axes [rad/s]; the covariance is that of the small turn d in R_true = R exp(d), and of the rate.
+rate in head axes [rad/s], which fades; the covariance is that of the small turn d in R_true = R exp(d), and of the
+rate.
 
 In a row of a roster (``roster.py``), ``x`` (2, 6) are position and velocity by the models, ``P`` (2, 6, 6) their
 covariances, ``weights`` (2,) those of still and moving; ``q`` (4,) x y z w; ``rate`` (3,); ``C`` (6, 6) the covariance
@@ -69,19 +70,31 @@ def _drift(P, dt, density):  # type: ignore[no-untyped-def]
 
 
 @rule
+def _fade(dt, fade_s):  # type: ignore[no-untyped-def]
+    """Return how far a rate of 1 that fades within ``fade_s`` goes on in ``dt``, and what is left of it then."""
+    left = np.exp(-dt / fade_s)
+    return fade_s * (1.0 - left), left
+
+
+@rule
+def _go_on(P, i, way, left):  # type: ignore[no-untyped-def]
+    """Predict the (6, 6) covariance: value ``i`` goes on by ``way`` times its rate, of which this much is ``left``."""
+    for j in range(6):
+        P[i, j] += way * P[3 + i, j]
+        P[3 + i, j] *= left
+    for j in range(6):
+        P[j, i] += way * P[j, 3 + i]
+        P[j, 3 + i] *= left
+
+
+@rule
 def _slow_down(x, P, dt, fade_s):  # type: ignore[no-untyped-def]
     """Predict the (6,) state and its covariance of what slows down: a speed that fades within ``fade_s`` (3,)."""
     for i in range(3):
-        left = np.exp(-dt / fade_s[i])
-        way = fade_s[i] * (1.0 - left)  # that a speed of 1 goes on
+        way, left = _fade(dt, fade_s[i])
         x[i] += way * x[3 + i]
         x[3 + i] *= left
-        for j in range(6):
-            P[i, j] += way * P[3 + i, j]
-            P[3 + i, j] *= left
-        for j in range(6):
-            P[j, i] += way * P[j, 3 + i]
-            P[j, 3 + i] *= left
+        _go_on(P, i, way, left)
 
 
 @rule
@@ -229,19 +242,27 @@ def predict_places(roster, before_ns, dt, still_s, moving_s, wander, density, fa
 
 
 @kernel
-def predict_turns(roster, dt, density):  # type: ignore[no-untyped-def]
-    """Predict orientations by ``dt`` seconds, in place; ``density`` (3,) [rad²/s³] is of white turn acceleration."""
+def predict_turns(roster, dt, density, fade_s):  # type: ignore[no-untyped-def]
+    """Predict orientations by ``dt`` seconds, in place; ``density`` (3,) [rad²/s³] is of white turn acceleration.
+
+    A turn fades within ``fade_s``. If its rate stayed, a track that is put right by a great angle would take that for a
+    turn, and could spin on for good: by 120 degrees a frame, every third measurement agrees with it.
+    """
     step, half, angle = np.empty(4), np.empty((3, 6)), np.empty(3)
+    way, left = _fade(dt, fade_s)
     for n in range(roster.shape[0]):
         q, rate, C = roster[n].q, roster[n].rate, roster[n].C
         if np.isnan(q[3]):
             continue
         for a in range(3):
-            angle[a] = dt * rate[a]
+            angle[a] = way * rate[a]
+            rate[a] *= left
         _turn(angle, step)
         _compose(q, step, q)
         _new_axes(C, step, half)
-        _drift(C, dt, density)
+        for a in range(3):
+            _go_on(C, a, way, left)
+        _stir(C, dt, density)
 
 
 @kernel

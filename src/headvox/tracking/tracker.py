@@ -36,6 +36,7 @@ STILL_S, MOVING_S = 8.0, 2.0  # mean times that a head rests and moves
 FIRST_SPEED_M_S = np.array([0.7, 0.7, 0.3])  # standard deviations of the velocity of a head that is new
 UPRIGHT = np.array([1.0, 1.0, 0.4])  # heads move along the floor more than up and down
 FADE_S = np.array([2.0, 2.0, 0.3])  # how long a head that is not seen goes on: up and down not for long
+TURN_FADE_S = 0.3  # how long a head turns on
 WANDER_M2_S = 1e-6  # a head at rest sways by a millimetre in a second
 TURN_GATE = 16.3  # squared Mahalanobis distance: one in a thousand is farther
 FIRST_TRUST = 0.15
@@ -228,7 +229,7 @@ class Tracker:
         """Move tracks on from one stamp to another, in place."""
         dt = (stamp_ns - before_ns) * 1e-9
         predict_places(roster, before_ns, dt, STILL_S, MOVING_S, WANDER_M2_S, self._density, FADE_S)
-        predict_turns(roster, dt, self._turn_density)
+        predict_turns(roster, dt, self._turn_density, TURN_FADE_S)
 
     def _predicted(self, stamp_ns: int) -> Roster:
         """Return a copy of the tracks, moved on to a stamp."""

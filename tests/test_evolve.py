@@ -13,8 +13,9 @@ import pytest
 from headvox.cli import main
 from headvox.data import Cloud, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
-from headvox.evolve import bank, boost, gates, samples, search, views
+from headvox.evolve import again, bank, boost, gates, samples, search, views
 from headvox.evolve.check import Outcome, check
+from headvox.evolve.spoil import spoil
 from headvox.evolve.write import Found, cascade_text, write_cascade
 from headvox.frames import inverse, transform
 from headvox.gate import pass_gate
@@ -285,6 +286,76 @@ def test_the_file_scores_as_the_models_do(evolved):
     assert len(np.unique(scores)) > 5
     assert (scores > DROPPED).all()
     np.testing.assert_allclose(scores / 1024.0, wanted, atol=trees * 0.0011)
+
+
+# ------------------------------------------------------------------------------------------------------ the last stage
+
+
+def test_a_spoilt_view_is_the_same_view_from_a_worse_sensor(real_view):
+    lost = []
+    for seed in range(12):
+        spoilt = spoil(real_view, np.random.default_rng(seed))
+        same = spoil(real_view, np.random.default_rng(seed))
+        lost.append(0)
+        for was, now, again_ in zip(
+            real_view.frame.depths, spoilt.frame.depths, same.frame.depths, strict=True
+        ):
+            np.testing.assert_array_equal(now.depth, again_.depth)
+            kept = now.depth > 0
+            np.testing.assert_array_equal(now.depth[kept], was.depth[kept])
+            lost[-1] += int((was.depth > 0).sum() - kept.sum())
+            np.testing.assert_allclose(
+                transform(inverse(now.T_world_camera), spoilt.heads.centres),
+                transform(inverse(was.T_world_camera), real_view.heads.centres),
+                atol=1e-9,
+            )
+            np.testing.assert_allclose(now.T_world_camera[2, :3], was.T_world_camera[2, :3], atol=1e-9)
+    assert min(lost) == 0 < max(lost)
+
+
+def test_heads_that_the_border_cuts_are_heads_to_the_last_stage_and_dummies_neither():
+    far_apart = np.array([[0.0, 0, 1.5], [1, 0, 1.5], [2, 0, 1.5], [3, 0, 1.5]])
+    clear, visible = np.array([True, False, False, False]), np.array([0.9, 0.6, 0.9, 0.1])
+    posture = np.array([0, 0, len(views.POSTURES), 0])  # whole, cut, a dummy, hardly seen
+    view = easy_view(None, 0, 1)
+    view = replace(view, heads=views.Heads(far_apart, visible, clear, posture))
+    found = (far_apart[None] + np.array([0.0, 0.2, 0.5])[:, None, None] * [1, 0, 0]).reshape(-1, 3)
+    label, bag = again._label(view, found)
+    assert label.tolist() == [1, 1, -1, -1] + [-1] * 4 + [0] * 4
+    assert bag.tolist() == [100, 101] + [-1] * 10
+
+
+def test_the_last_stage_is_single_cuts_over_what_was_asked_before(evolved, monkeypatch):
+    folder, found, _ = evolved
+    monkeypatch.setattr(search, "keep_view", easy_view)
+    monkeypatch.setattr(search, "spoilt_peaks", doubtful_peaks)
+    monkeypatch.setattr(again, "LEAST_ROWS", 5)
+    monkeypatch.setattr(samples, "RANGE_M", 2.8)
+    said: list[str] = []
+    more = search._with_second_opinion(search.Settings(folder, 200, "easy"), found, said.append)
+    assert said[-1].startswith("asked again: ")
+    once, twice = (load_cascade(str(folder / name)) for name in ("once.toml", "twice.toml"))
+    assert twice.groups == once.groups
+    assert twice.judge[:-1] == once.judge
+    last = twice.judge[-1]
+    assert last.name == more.judge[-1].plan.name == again.PLAN.name
+    assert 0 < len(last.trees) <= again.PLAN.trees
+    cuts = [tree for tree in last.trees if isinstance(tree, tuple)]  # the others are constants
+    assert cuts
+    assert all(isinstance(leaf, float) for cut in cuts for leaf in cut[2:])
+
+
+def doubtful_peaks(view: views.View, cascade) -> again.Peaks | None:
+    """The peaks of an easy view, of which those of every third are said to be no heads: else all of them are."""
+    peaks = again.spoilt_peaks(view, cascade)
+    if peaks is None or view.number % 3:
+        return peaks
+    return replace(peaks, samples=replace(peaks.samples, label=0 * peaks.samples.label))
+
+
+def test_the_last_stage_needs_heads_and_others():
+    made, score = samples_of([1.0, 2.0], [1, 1], [16, 32])
+    assert again.fit_again(again.Peaks(made, score), ["cube5"], seed=0) is None
 
 
 # ---------------------------------------------------------------------------------------------------------- the border

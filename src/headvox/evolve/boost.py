@@ -86,7 +86,7 @@ def boost(samples: Samples, plans: tuple[Plan, ...], seed: int, say: Callable[[s
         have = have + _choose(samples, plan, rows, score, have, seed)
         allowed = pool | POOLS["occupied"] if plan.pool == "seen" else pool
         columns = np.flatnonzero(np.isin(GROUP_OF, have) & allowed)
-        model, score = _fit(
+        model, score = fit(
             samples, columns, rows, score, plan.trees, plan.rate, 1.0 if plan.trees < 40 else 0.5, seed
         )
         keep = quantile_of_heads(samples, score, ~samples.aside & rows, plan.lose)
@@ -106,7 +106,7 @@ def _choose(
         share = CHOOSING_ROWS / negatives.sum()
         few = few & ((np.random.default_rng(seed).random(len(rows)) < share) | (samples.label == 1))
     columns = np.flatnonzero(POOLS[plan.pool])
-    model, _ = _fit(samples, columns, few, score, CHOOSING_TREES, 0.2, 0.5, seed)
+    model, _ = fit(samples, columns, few, score, CHOOSING_TREES, 0.2, 0.5, seed)
     gain: Counter[str] = Counter()
     for column, value in zip(columns, model.feature_importance("gain"), strict=True):
         group = str(GROUP_OF[column])
@@ -125,10 +125,15 @@ def columns_of(samples: Samples, rows: Mask, columns: npt.NDArray[Any]) -> npt.N
     return out
 
 
-def _fit(
+def fit(
     samples: Samples, columns: npt.NDArray[Any], rows: Mask, start: F64 | None, trees: int, rate: float,
-    share: float, seed: int,
+    share: float, seed: int, other: dict[str, int] | None = None, head_weight: float = HEAD_WEIGHT,
 ) -> tuple[Any, F64]:  # fmt: skip
+    """Fit trees to those of ``rows`` that are not kept aside; return the model, and every row's score with it.
+
+    ``start`` is the score before, ``share`` that of the ``columns`` that each tree may use, ``other`` what goes before
+    LightGBM's settings here.
+    """
     try:
         import lightgbm
     except ImportError:
@@ -140,12 +145,13 @@ def _fit(
         columns_of(samples, learn, columns),
         samples.label[learn],
         init_score=None if start is None else start[learn],
-        weight=np.where(samples.label[learn] == 1, HEAD_WEIGHT, 1.0),
+        weight=np.where(samples.label[learn] == 1, head_weight, 1.0),
     )
     settings = {
         "objective": "binary", "num_leaves": 8, "max_depth": 4, "learning_rate": rate, "min_data_in_leaf": 40,
         "feature_fraction": share, "bagging_fraction": 0.8, "bagging_freq": 1, "lambda_l2": 3.0, "seed": seed + 1,
         "deterministic": True, "force_row_wise": True, "num_threads": 2, "verbose": -1,
+        **(other or {}),
     }  # fmt: skip
     model = lightgbm.train(settings, data, trees)
     score = np.full(len(rows), -1e3)

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.compile_masks import SCORE_UNIT
 from headvox.config import DetectorConfig
 from headvox.data import F64, Expected, Frame
 from headvox.errors import HeadvoxError
@@ -25,6 +24,7 @@ from headvox.evolve import boost, samples
 from headvox.evolve.samples import Grid, Samples, join, to_find
 from headvox.evolve.spoil import spoil
 from headvox.evolve.views import LEAST_VISIBLE, View
+from headvox.masks.compile import SCORE_UNIT
 from headvox.memory import Memory
 from headvox.pipeline import Detector
 from headvox.synth.scene import POSTURES

@@ -35,7 +35,7 @@ from headvox.evolve.views import View, keep_view
 from headvox.evolve.write import Found, cascade_text, write_cascade
 from headvox.masks.cascade import Cascade, Condition
 from headvox.masks.compile import CompiledCascade, CompiledGate, compile_cascade
-from headvox.masks.read import parse_cascade
+from headvox.masks.read import load_cascade, parse_cascade
 from headvox.parallel.workers import ALONE, Workers
 
 GATE_VIEWS = 3000
@@ -116,8 +116,8 @@ def _with_second_opinion(settings: Settings, found: Found, say: Say) -> Found:
     if not parts:
         return found
     peaks = Peaks.join(parts)
-    used = {name.rpartition(".")[0] for stage in (*found.search, *found.judge) for name in stage.names}
-    last = fit_again(peaks, sorted(used), settings.seed)
+    asked = [group.name for group in load_cascade(str(path)).groups]
+    last = fit_again(peaks, asked, settings.seed)
     if last is None:
         return found
     heads = int(peaks.samples.label.sum())

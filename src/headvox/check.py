@@ -17,6 +17,11 @@ def origins_of(frame: Frame) -> F64:
     return np.array([T[:3, 3] for T in placed], dtype=np.float64).reshape(-1, 3)
 
 
+def knows_an_origin(frame: Frame) -> bool:
+    """Return whether it is known where any of the sensors stands."""
+    return len(frame.depths) > 0 or any(cloud.T_world_sensor is not None for cloud in frame.clouds)
+
+
 def check_frame(frame: Frame) -> None:
     """Raise HeadvoxError where a reading has another shape or type than it should, or a place that is not rigid."""
     if not frame.clouds and not frame.depths:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.assemble import MOST_POSES, heads_at, with_poses
-from headvox.check import check_frame, nothing_in_range, origins_of
+from headvox.check import check_frame, knows_an_origin, nothing_in_range
 from headvox.config import DetectorConfig
 from headvox.cuda.detect import DEVICE_STAGES, OnDevice
 from headvox.cuda.device import BATCH, DeviceLost, use_device
@@ -39,7 +39,6 @@ from headvox.voxelize import (
     mark_points,
     new_blocks,
     new_box,
-    part_transform,
 )
 
 I32 = npt.NDArray[np.int32]
@@ -47,7 +46,9 @@ I64 = npt.NDArray[np.int64]
 
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
 FEW = 128
-"""Candidates that are scored before a second thread would have begun."""
+"""Candidates that are scored before a second thread would have begun, and"""
+FEW_PEAKS = 16
+"""peaks that are looked at in the images by then."""
 
 
 class Detector:
@@ -197,6 +198,7 @@ class Detector:
         limits, shape, shift = memory.limits, lattice.shape, lattice.subdivision - 1
         counting = self.cascade.source.counting
         boxes = [new_box() for _ in range(parts)]
+        transforms = [self._placing.transform(cloud, lattice) for cloud in frame.clouds]
         views = [self._placing.view(image, lattice) for image in frame.depths]
         memory.make_room_for_width(max((image.depth.shape[1] for image in frame.depths), default=0))
 
@@ -207,8 +209,7 @@ class Detector:
             memory.clear(part, dirty)
             common = (limits, memory.bits, shape, shift, counting)
             cells, marking, box = memory.grids[part], memory.marking[part], boxes[part]
-            for cloud, taken in zip(frame.clouds, blocks, strict=False):
-                T = part_transform(cloud, lattice)
+            for cloud, T, taken in zip(frame.clouds, transforms, blocks, strict=False):
                 mark_points(read_only(cloud.points), taken, T, *common, *marking.for_points(), box, cells)
             for image, (rays, _), taken in zip(frame.depths, views, blocks[len(frame.clouds) :], strict=True):
                 depth, room = read_only(image.depth), marking.for_depth(image.depth.shape[1])
@@ -358,7 +359,7 @@ class Detector:
                 look_about(depth, table, cells, judge.offsets, states)
             count_states(states, judge.offset_start, seen)
 
-        shares = shares_of(len(cells), self._threads.count)
+        shares = shares_of(len(cells), 1 if len(cells) < FEW_PEAKS else self._threads.count)
         calls = [(in_lattice[low:high], states[low:high], seen[low:high]) for _, low, high in shares]
         self._threads.run(look, calls)
         scores = np.empty(len(cells), np.int64)
@@ -380,7 +381,7 @@ class Detector:
         spheres = None if self.config.refine == "none" else self._fit_spheres(cells, memory)
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks]]
-        haired = len(origins_of(frame)) > 0
+        haired = knows_an_origin(frame)
         heads = heads_at(memory.centres(cells), scores, least, spheres, haired, yaws)
         if self.config.refine != "pose":
             return heads

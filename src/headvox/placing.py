@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from headvox.check import origins_of
 from headvox.config import DetectorConfig
-from headvox.data import F32, DepthImage, Frame, Intrinsics
+from headvox.data import F32, Cloud, DepthImage, Frame, Intrinsics
 from headvox.fuse import Region
 from headvox.masks.compile import CompiledCascade
 from headvox.visibility import camera_table
-from headvox.voxelize import Lattice, Rays
+from headvox.voxelize import Lattice, Rays, part_transform
 
 
 class View(NamedTuple):
@@ -22,12 +24,13 @@ class View(NamedTuple):
 
 
 class Placing:
-    """Lattices and views, made anew only when a sensor moved."""
+    """Lattices, views and transforms, made anew only when a sensor moved."""
 
     def __init__(self, config: DetectorConfig) -> None:
         self.config = config
         self._lattice: Lattice | None = None
         self._views: dict[str, tuple[Intrinsics, bytes, Lattice, View]] = {}
+        self._transforms: dict[str, tuple[bytes | None, Lattice, F32]] = {}
 
     def lattice(self, frame: Frame, cascade: CompiledCascade) -> Lattice:
         """Return the lattice that ``cascade`` searches ``frame`` in; the same object while its region is the same.
@@ -56,6 +59,15 @@ class Placing:
             view = View(Rays.of(image, lattice), camera_table(image, lattice))
             known = self._views[image.name] = (lens, place, lattice, view)
         return known[3]
+
+    def transform(self, cloud: Cloud, lattice: Lattice) -> F32:
+        """Return (4, 4) from the frame of ``cloud`` to parts of ``lattice``."""
+        T = cloud.T_world_sensor
+        place = None if T is None else np.asarray(T, dtype=np.float64).tobytes()
+        known = self._transforms.get(cloud.name)
+        if known is None or known[0] != place or known[1] is not lattice:
+            known = self._transforms[cloud.name] = (place, lattice, part_transform(cloud, lattice))
+        return known[2]
 
     def rays(self, image: DepthImage, lattice: Lattice) -> Rays:
         """Return the rays of the pixels of ``image`` in ``lattice``."""

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import types
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from headvox import __version__, cli
+from headvox.commands.flags import TRACKER_FLAGS
+from headvox.config import TrackerConfig
 
 COMMAND = Path(sys.executable).with_name("headvox")
 HEAVY = ("numba", "numpy", "scipy", "PIL", "matplotlib")
@@ -564,6 +567,13 @@ def test_settings_of_the_tracker_by_flag_and_file(recording: Path, anything: Pat
     done = headvox("run", recording, "--json", "--limit", 1, *more)
     assert {head["state"] for head in heads_of(done.stdout)[0]} == {"tentative"}  # type: ignore[attr-defined]
     assert_explained(headvox("run", recording, "--confirm-hits", 9), 2)
+
+
+def test_every_setting_of_the_tracker_has_a_flag() -> None:
+    assert {name for _, name, *_ in TRACKER_FLAGS} == {field.name for field in fields(TrackerConfig)}
+    shown = headvox("config", "--strong-score", 3.5, "--present", 2).stdout
+    assert "\nstrong_score = 3.5\n" in shown
+    assert "\npresent_s = 2.0\n" in shown
 
 
 def test_a_trajectory_a_track(recording: Path, anything: Path, tmp_path: Path) -> None:

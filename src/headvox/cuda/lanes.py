@@ -39,9 +39,9 @@ def device(function: Loop) -> Loop:
     return compiled
 
 
-def on_device(rule: Loop, **names: object) -> Loop:
+def on_device(rule: Any, **names: object) -> Loop:
     """Return a rule of the CPU for the device, with ``names`` in place of what it calls so."""
-    source = rule.py_func  # type: ignore[attr-defined]
+    source = rule.py_func
     scope = {**source.__globals__, **names}
     return device(FunctionType(source.__code__, scope, source.__name__, source.__defaults__))
 
@@ -53,8 +53,7 @@ def _math() -> ModuleType:
     stand_in = ModuleType("math_on_device")
     for name in ("sqrt", "exp", "log", "sin", "cos", "floor", "ceil", "isfinite", "inf", "nan"):
         setattr(stand_in, name, getattr(math, name))
-    stand_in.arctan2 = math.atan2  # type: ignore[attr-defined]
-    stand_in.float64, stand_in.int64 = np.float64, np.int64  # type: ignore[attr-defined]
+    vars(stand_in).update(arctan2=math.atan2, float64=np.float64, int64=np.int64)
     return stand_in
 
 
@@ -149,7 +148,8 @@ if SIMULATED:
 
     def wait_for_block() -> None:
         """Wait for all threads of the block: the simulator knows cuda.syncthreads in a kernel's own file only."""
-        threading.current_thread().syncthreads()  # type: ignore[attr-defined]
+        thread: Any = threading.current_thread()
+        thread.syncthreads()
 
     def mul(a, b):  # type: ignore[no-untyped-def]
         """Return a * b."""

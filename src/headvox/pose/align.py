@@ -29,9 +29,8 @@ COST, ON_SURFACE, CROSSED, EVIDENCE = 0, 1, 2, 3  # what is told of a fit
 TOLD = 4
 
 ROOM = 808  # a row of the Jacobian: all points and rays in whole vectors; an odd number of lines of the cache
-INDEPENDENT = (
-    120.0  # so many points at most count in full: how a head differs from the template, neighbours share
-)
+# So many points at most count in full: how a head differs from the template, neighbours share.
+INDEPENDENT = 120.0
 RAY_WEIGHT = 8.0
 CENTRE_SIGMA_M = 0.05
 SCALE_SIGMA = 0.05

@@ -21,11 +21,8 @@ COARSE_STEPS, FINE_STEPS, POLISH_STEPS = 4, 5, 2
 COARSE_SAMPLES, FINE_SAMPLES, POLISH_SAMPLES = 120, 240, 400
 FINE_RAYS, POLISH_RAYS = 120, 400
 COARSE_MODES = 0
-COARSE_K, FINE_K, LAST_K = (
-    4.0,
-    4.0,
-    2.5,
-)  # of the first coarse step (1 less each step), the first and last fine one
+# Of the first coarse step (1 less each step), the first and the last fine one.
+COARSE_K, FINE_K, LAST_K = 4.0, 4.0, 2.5
 MOST_STARTS = 60
 MOST_REFINED = 6
 MARGIN = 5.0  # a start that costs more than the best one by this is not refined, but for the second best
@@ -287,10 +284,8 @@ def refine(work, trials, i, at, template):  # type: ignore[no-untyped-def]
     The last state, and what it costs, are left in ``trials``.
     """
     A, x, state, told, counts = work.A, work.x, trials.states[i, at], trials.told[i, at], trials.counts[i]
-    modes, always = (
-        np.int64(FINE_MODES),
-        np.bool_(True),
-    )  # constants would make Numba compile linearise for each
+    # Plain constants would make Numba compile linearise for each of them.
+    modes, always = np.int64(FINE_MODES), np.bool_(True)
     for step in range(FINE_STEPS + 1):
         k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
         cost = linearise(

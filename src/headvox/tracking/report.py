@@ -11,9 +11,8 @@ from headvox.tracking.roster import Roster
 
 TENTATIVE, CONFIRMED, COASTING = int(State.TENTATIVE), int(State.CONFIRMED), int(State.COASTING)
 LEAST_REACH_M, MOST_REACH_M = 0.12, 0.4  # about an expected place
-EXPECTED_DIGITS = (
-    1e3  # of a quaternion that a fit starts from: its rounding errors must not grow from frame to frame
-)
+# Of a quaternion that a fit starts from: its rounding errors must not grow from frame to frame.
+EXPECTED_DIGITS = 1e3
 
 
 def report(roster: Roster, last_ns: int, stamp_ns: int) -> Tracks:

@@ -19,6 +19,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
@@ -54,7 +55,7 @@ SENSOR_PARAMETERS = [
     Parameter("autostart", True, "Configure and activate at once, without a lifecycle manager.", None),
 ]
 CHANGEABLE = {"tf_wait_s"}
-PROBLEMS = ("frames_without_answer", "without_transform", "bad_messages")
+PROBLEMS = ("frames_without_answer", "without_transform", "bad_messages", "lost")
 WORRYING = (*PROBLEMS, "late", "clock_jumps", "refused_transforms")
 
 
@@ -75,7 +76,8 @@ class SensorNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._told: dict[str, int] = {}
-        self.create_timer(DIAGNOSTICS_EVERY_S, self._tell)
+        # Not in the clock of a simulation: that it stands still is to be told, too.
+        self.create_timer(DIAGNOSTICS_EVERY_S, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     # -------------------------------------------------------------------------------------------- for each kind of node
 

@@ -87,7 +87,8 @@ def play(
             settings += [f"silent:=['{silent}']"]
             player = processes.start("play_recording", settings, said)
             processes.spin_until(listener, lambda: player.poll() is not None, float("inf"), node)
-            processes.spin_until(listener, lambda: False, 1.5, node)
+            told = len(heard.rows)  # and figures that the node took after the last frame
+            processes.spin_until(listener, lambda: len(heard.rows) > told + 1, processes.END_S, node)
         finally:
             processes.end(process for process in (player, node) if process is not None)
             listener.destroy_node()
@@ -127,6 +128,7 @@ def report(recording: str, heard: Heard, rate_hz: float, loops: int) -> dict[str
         "frames the player skipped": heard.skipped,
         "frames answered": len(delays),
         "frames left out for fresher ones": max(int(row["replaced_by_fresher"]) for row in heard.rows),
+        "messages lost": max(int(row["lost"]) for row in heard.rows),
         "answers a second": (len(came) - 1) / (1e-9 * float(came[-1] - came[0])) if len(came) > 1 else 0.0,
         "longest gap [ms]": 1e-6 * float(np.diff(came).max(initial=0)),
         "arrival to publish, p50 [ms]": float(np.median([float(row["latency_p50_ms"]) for row in windows])),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
@@ -15,6 +15,7 @@ from tf2_msgs.msg import TFMessage
 from headvox.data import Cloud, DepthImage, Frame
 from headvox.errors import HeadvoxError
 from headvox.machine.latest import Latest
+from headvox.ros.losses import Losses
 from headvox.ros.messages import cloud_points, depth_image, intrinsics, stamp_ns
 from headvox.ros.synchronise import NS, Reading, Synchroniser
 from headvox.ros.transforms import NoTransform, TransformBuffer, set_from
@@ -22,6 +23,7 @@ from headvox_ros.statistics import Statistics
 
 RELIABILITIES = {"best_effort": ReliabilityPolicy.BEST_EFFORT, "reliable": ReliabilityPolicy.RELIABLE}
 DEPTH = 2  # messages that wait for us: a longer queue would only hold older ones
+LOST = "Does every process use a profile for large messages (docs/ros.md), and is there time to receive them?"
 
 
 class Sensors:
@@ -46,6 +48,7 @@ class Sensors:
         self._node = node
         self._statistics = statistics
         self._synchroniser = synchroniser
+        self._losses = Losses()
         self._lock = threading.Lock()
         self._sets: Latest[list[Reading]] = Latest()
         self._infos: dict[str, CameraInfo] = {}
@@ -68,9 +71,12 @@ class Sensors:
     def _subscribe(
         self, kind: Any, topic: str, callback: Callable[[str, Any], None], qos: QoSProfile, name: str = ""
     ) -> None:
-        self._subscriptions.append(
-            self._node.create_subscription(kind, topic, lambda m: callback(name or topic, m), qos)
-        )
+        def heard(message: Any, info: Mapping[str, Any]) -> None:
+            if lost := self._losses.before(info):
+                self._statistics.problem("lost", f"{topic}: messages do not get here. {LOST}", lost)
+            callback(name or topic, message)
+
+        self._subscriptions.append(self._node.create_subscription(kind, topic, heard, qos))
 
     # ------------------------------------------------------------------------------------------------ the node's thread
 
@@ -87,9 +93,10 @@ class Sensors:
             sets = self._synchroniser.add(Reading(name, stamp_ns(message.header.stamp), now, message))
             if self._synchroniser.jumps > jumps:
                 self.transforms.forget_moving()
-        self._offer(sets)
+            self._offer(sets)
 
     def _offer(self, sets: list[list[Reading]]) -> None:
+        """Lay sets out; with the lock, or the other thread's newer ones would be laid out before."""
         for one in sets:
             self._sets.put(one)
 

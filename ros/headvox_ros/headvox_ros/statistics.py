@@ -26,9 +26,9 @@ class Statistics:
         self.counts["frames"] += 1
         self._frames.append((done_s, latency_s))
 
-    def problem(self, kind: str, reason: str) -> None:
+    def problem(self, kind: str, reason: str, times: int = 1) -> None:
         """Count something that went wrong."""
-        self.counts[kind] += 1
+        self.counts[kind] += times
         self.reasons[kind] = self.last_problem = reason
 
     def rate_hz(self, now_s: float) -> float:

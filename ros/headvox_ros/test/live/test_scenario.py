@@ -40,7 +40,8 @@ def test_a_walking_person_between_two_cameras(rig, sensors):
     assert answered == sorted(set(answered))
     assert set(answered) <= set(sent)
     due = sum(stamp >= answered[0] for stamp in sent) - figures["frames the player skipped"]
-    assert len(answered) + figures["frames left out for fresher ones"] >= due
+    left_out = figures["frames left out for fresher ones"] + figures["messages lost"]
+    assert len(answered) + left_out >= due
     found = figures["recall"] * figures["heads"] / figures["frames answered"]
     assert found > 0.9
     assert figures["false a frame"] < 0.5

@@ -73,7 +73,7 @@ def lay_out(commit: str, folder: Path) -> Path:
 def save_frames(file: Path) -> None:
     """Make the frames once, with the working tree's own generator: both measure the same bytes."""
     sys.path.insert(0, str(ROOT / "src"))
-    from headvox.bench.command import make_input
+    from headvox.bench.input import make_input
 
     data = make_input()
     arrays = {"cloud": data.cloud, "shell": data.shell}

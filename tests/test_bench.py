@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from headvox import cli
-from headvox.bench import command as bench
+from headvox.bench import command
+from headvox.bench import measure as bench
+from headvox.bench.report import report
 from headvox.pipeline import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -68,7 +70,7 @@ def test_the_machine_is_named(result):
     assert machine["processor"]
     assert machine["cores"] >= 1
     assert machine["python"].startswith(f"{sys.version_info.major}.{sys.version_info.minor}")
-    text = bench.report(result)
+    text = report(result)
     for told in (machine["processor"], machine["numba"], "slowest / fastest", "million points", *STAGES):
         assert told in text
 
@@ -82,7 +84,7 @@ def test_the_input_is_the_same_every_time():
 
 def test_the_command_prints_one_json_object(capsys, monkeypatch, result):
     asked = []
-    monkeypatch.setattr(bench, "measure", lambda *args: asked.append(args[:5]) or result)
+    monkeypatch.setattr(command, "measure", lambda *args: asked.append(args[:5]) or result)
     assert cli.main(["bench", "--quick", "--json", "--cascade", "paper"]) == 0
     assert json.loads(capsys.readouterr().out) == result
     assert cli.main(["bench", "--rounds", "7"]) == 0
@@ -102,7 +104,7 @@ def test_without_open3d_it_says_so(monkeypatch, result):
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert bench._import_open3d() is None
     without = {**result, "open3d": None, "ms": {k: v for k, v in result["ms"].items() if k != bench.OPEN3D}}
-    assert "Open3D is not installed" in bench.report(without)
+    assert "Open3D is not installed" in report(without)
 
 
 def test_the_comparison_of_commits_explains_itself():

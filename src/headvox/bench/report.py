@@ -10,7 +10,7 @@ Values = dict[str, Any]
 
 
 def report(result: Values) -> str:
-    """Return what :func:`headvox.bench.command.measure` found, as tables."""
+    """Return what :func:`headvox.bench.measure.measure` found, as tables."""
     machine, data = result["machine"], result["input"]
     cores = f"{machine['cores_for_this_process'] or machine['cores']} of {machine['cores']} cores"
     versions = f"Python {machine['python']}, numpy {machine['numpy']}, numba {machine['numba']}"

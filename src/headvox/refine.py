@@ -13,6 +13,7 @@ import numpy as np
 
 from headvox.machine.cholesky import factor, substitute
 from headvox.machine.kernels import bare_kernel, kernel, rule
+from headvox.machine.simd import LANES, add, beginning, fill, load, mul, sub, total
 
 REACH_M = 0.16
 BELOW_M = 0.09
@@ -94,7 +95,8 @@ def weigh_part(px, py, pz, sphere):  # type: ignore[no-untyped-def]
     distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
     residual = distance - sphere[3]
     weight = 1.0 / (1.0 + residual * residual / (SURFACE_SIGMA_M * SURFACE_SIGMA_M))
-    return -dx / distance, -dy / distance, -dz / distance, residual, weight
+    inverse = -1.0 / distance
+    return dx * inverse, dy * inverse, dz * inverse, residual, weight
 
 
 @rule
@@ -146,17 +148,38 @@ def fit_spheres(grids, shape, peaks, voxel_m, subdivision, counting, room, spher
     for i in range(peaks.shape[0]):
         at = peaks[i]
         count = _gather(grids, shape, at[0], at[1], at[2], voxel_m, subdivision, counting, room)
+        whole = -(-count // LANES) * LANES  # the last vector is a whole one
+        room[:3, count:whole] = 0.0
         sphere = spheres[i]
         sphere[:] = 0.0
         sphere[RADIUS] = RADIUS_M
         for _ in range(STEPS):
             sums[:] = 0.0
             add_priors(sphere, sums)
-            _weigh(room, count, sphere)
-            for k in range(np.uint64(count)):
-                add_weighed(room[3, k], room[4, k], room[5, k], room[6, k], room[7, k], sums)
+            _weigh(room, whole, sphere)
+            _add_all(room, count, sums)
             sphere[RMS] = take_step(sums, A, b, sphere)
         sphere[COUNT] = count
+
+
+@bare_kernel
+def _add_all(room, count, sums):  # type: ignore[no-untyped-def]
+    """Add to ``sums`` what each of ``count`` parts in ``room`` says: as :func:`add_weighed`, LANES parts at a time."""
+    flat, length = room.reshape(-1), room.shape[1]
+    none = fill(0.0)
+    # i stands for the derivative by the radius, -1, and r for the residual.
+    xx = xy = xz = xi = yy = yz = yi = zz = zi = ii = xr = yr = zr = ir = rr = none
+    for k in range(0, count, LANES):
+        x, y, z = load(flat, 3 * length + k), load(flat, 4 * length + k), load(flat, 5 * length + k)
+        r, w = load(flat, 6 * length + k), beginning(load(flat, 7 * length + k), count - k)
+        wx, wy, wz, wr = mul(w, x), mul(w, y), mul(w, z), mul(w, r)
+        xx, xy, xz, xi = add(xx, mul(wx, x)), add(xy, mul(wx, y)), add(xz, mul(wx, z)), sub(xi, wx)
+        yy, yz, yi = add(yy, mul(wy, y)), add(yz, mul(wy, z)), sub(yi, wy)
+        zz, zi, ii = add(zz, mul(wz, z)), sub(zi, wz), add(ii, w)
+        xr, yr, zr, ir = sub(xr, mul(wx, r)), sub(yr, mul(wy, r)), sub(zr, mul(wz, r)), add(ir, wr)
+        rr = add(rr, mul(wr, r))
+    for at, lanes in enumerate((xx, xy, xz, xi, yy, yz, yi, zz, zi, ii, xr, yr, zr, ir, rr, ii)):
+        sums[at] += total(lanes)
 
 
 @bare_kernel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64, Heads
+from headvox.data import F64, Heads, unknown
 from headvox.masks.compile import SCORE_UNIT
 from headvox.pose.fit import Poses
 from headvox.refine import HAIR_M
@@ -27,8 +27,9 @@ def heads_at(
     ``spheres`` (N, 6) were fitted about the voxels (:func:`headvox.refine.fit_spheres`); ``haired`` says that they lie
     on hair, not on the skull. ``yaws`` (N,) are in radians, if known. Heads that score ``least`` are sure.
     """
-    radii = np.full(len(centres), RADIUS_M)
-    if spheres is not None:
+    if spheres is None:
+        radii: F64 = np.full(len(centres), RADIUS_M)
+    else:
         centres, radii = centres + spheres[:, :3], spheres[:, 3]
         if haired:
             centres[:, 2] -= HAIR_M
@@ -38,8 +39,9 @@ def heads_at(
 
 def stated(centres: F64, radii: F64, scores: I64, least: int, yaws: F64 | None) -> Heads:
     """Return heads of which this is known: see :func:`heads_at`."""
-    quaternions = np.full((len(centres), 4), np.nan)
-    if yaws is not None:
+    if yaws is None:
+        quaternions = unknown(len(centres), 4)
+    else:
         half, none = 0.5 * yaws, np.zeros(len(yaws))
         quaternions = np.stack([none, none, np.sin(half), np.cos(half)], axis=1)
     return Heads(centres, quaternions, radii, scores / SCORE_UNIT, sure=scores >= least)

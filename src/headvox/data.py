@@ -82,6 +82,13 @@ def _empty(*shape: int) -> F64:
     return np.empty(shape, dtype=np.float64)
 
 
+def unknown(*shape: int) -> F64:
+    """Return NaN for each number."""
+    numbers = np.empty(shape)  # np.full takes longer than all else that a head is stated with
+    numbers.fill(np.nan)
+    return numbers
+
+
 @dataclass(frozen=True, slots=True)
 class Heads:
     """The heads found in one frame, as a structure of arrays, best score first.
@@ -110,7 +117,7 @@ class Heads:
             object.__setattr__(self, "sure", np.ones(len(self.scores), np.bool_))
         for name in ("centre_covariances", "rotation_covariances"):
             if len(getattr(self, name)) != len(self.scores) or getattr(self, name).ndim != 3:
-                object.__setattr__(self, name, np.full((len(self.scores), 3, 3), np.nan))
+                object.__setattr__(self, name, unknown(len(self.scores), 3, 3))
 
     def __len__(self) -> int:
         return len(self.scores)

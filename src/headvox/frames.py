@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -34,20 +35,29 @@ def as_rigid(matrix: npt.ArrayLike, name: str) -> F64:
         raise HeadvoxError(
             f"{name}: expected a 4x4 matrix, got shape {T.shape}.", "Give four rows of four numbers."
         )
-    # Plain numbers: it is done for each sensor of each frame, and a call of NumPy takes longer than all of it.
+    fault = _fault_of(T.tobytes())
+    if fault is not None:
+        what, hint = fault
+        raise HeadvoxError(f"{name}: {what}", hint)
+    return T
+
+
+@lru_cache(maxsize=64)
+def _fault_of(matrix: bytes) -> tuple[str, str] | None:
+    """Return what is wrong with a 4x4 matrix, and what to do. Each frame asks of the same sensors: it is kept."""
+    T = np.frombuffer(matrix).reshape(4, 4)
+    # Plain numbers: a sensor that moves is asked about in each frame, and a call of NumPy takes longer than all of it.
     *rows, last = T.tolist()
     if not all(map(math.isfinite, [*rows[0], *rows[1], *rows[2], *last])):
-        raise HeadvoxError(
-            f"{name}: the matrix has NaN or infinite entries.", "An unknown transform is not usable."
-        )
+        return "the matrix has NaN or infinite entries.", "An unknown transform is not usable."
     if max(abs(last[0]), abs(last[1]), abs(last[2]), abs(last[3] - 1.0)) > RIGID_TOLERANCE:
-        raise HeadvoxError(f"{name}: the last row is {last}, expected 0 0 0 1.", "Is it transposed?")
+        return f"the last row is {last}, expected 0 0 0 1.", "Is it transposed?"
     if not _is_rotation(*rows):
-        raise HeadvoxError(
-            f"{name}: the rotation part is not a rotation (determinant {np.linalg.det(T[:3, :3]):.3g}).",
+        return (
+            f"the rotation part is not a rotation (determinant {np.linalg.det(T[:3, :3]):.3g}).",
             "Expected an invertible, unscaled, right-handed rotation.",
         )
-    return T
+    return None
 
 
 def _is_rotation(a: list[float], b: list[float], c: list[float]) -> bool:

@@ -94,7 +94,13 @@ def suppress(cells: I32, scores: I64, least: int, shape: tuple[int, ...], reach:
 
 
 @kernel
-def _keep_apart(centres, order, distance2, kept):  # type: ignore[no-untyped-def]
+def _keep_apart(centres, scores, distance2, order, kept):  # type: ignore[no-untyped-def]
+    for i in range(order.shape[0]):  # best first: they are few
+        k = i
+        while k > 0 and scores[order[k - 1]] < scores[i]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
     count = 0
     for i in order:
         apart = True
@@ -114,6 +120,6 @@ def _keep_apart(centres, order, distance2, kept):  # type: ignore[no-untyped-def
 
 def suppress_overlaps(centres: F64, scores: npt.NDArray[np.generic], distance_m: float) -> I64:
     """Return the indices to keep, best score first, so that no two centres (N, 3) are closer than ``distance_m``."""
-    order = np.argsort(-scores.astype(np.float64), kind="stable")
-    kept = np.empty(len(order), np.int64)
-    return kept[: _keep_apart(np.ascontiguousarray(centres), order, distance_m * distance_m, kept)]
+    order, kept = np.empty((2, len(scores)), np.int64)
+    centres, scores = np.ascontiguousarray(centres), scores.astype(np.float64)
+    return kept[: _keep_apart(centres, scores, distance_m * distance_m, order, kept)]

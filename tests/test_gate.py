@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 
-from headvox.gate import gate_columns, gate_tables, list_passed, pass_gate, shape_of_passed
+from headvox.gate import SLICES, gate_columns, gate_tables, list_passed, pass_gate, shape_of_passed
 from headvox.integral import box_reach, integral_volume, set_corners, with_margins
 from headvox.masks.cascade import Box, Cascade, Condition, Group
 from headvox.masks.compile import compile_cascade
@@ -229,10 +229,14 @@ def test_shares_of_a_part_of_the_volume_are_together_that_part(spacing, shape):
         for parts in (1, 2, 3):
             passed = np.full(shape_of_passed(region), 0xFFFFFFFF, np.uint32)  # what an earlier frame left
             for part in range(parts):
-                share = region.copy()
-                share[:2] = region[0] + (region[1] - region[0]) * np.array([part, part + 1]) // parts
-                rows = passed[slice(*share[:2] - region[0])]
-                gate_columns(S, share, *gate_tables(gate, S.dtype), spacing, odd + margin, corners, rows)
+                first, end = len(passed) * np.array([part, part + 1]) // parts
+                rows, tables = passed[first:end], gate_tables(gate, S.dtype)
+                common = (S[first:], region, first, *tables, spacing, odd + margin, corners)
+                gate_columns(*common, np.zeros(1, np.int64), rows)
+                rest = np.full_like(rows, 7)
+                gate_columns(*common, np.ones(1, np.int64), rest)  # another thread took the first block
+                assert (rest[:SLICES] == 7).all()
+                np.testing.assert_array_equal(rest[SLICES:], rows[SLICES:])
             survivors = np.empty((cells.size, 3), np.int32)
             count = list_passed(passed, region, survivors)
             np.testing.assert_array_equal(survivors[:count] - margin, wanted)

@@ -268,7 +268,7 @@ def test_a_frame_that_fails_midway_leaves_nothing_behind(make, monkeypatch):
     def fail(*_):
         raise KeyboardInterrupt
 
-    for stage in ("_integrate", "_gate", "_vote", "_suppress", "_judge", "_refine"):
+    for stage in ("_gate", "_vote", "_suppress", "_judge", "_refine"):
         with monkeypatch.context() as patch:
             patch.setattr(detector, stage, fail)
             with pytest.raises(KeyboardInterrupt):

@@ -149,6 +149,25 @@ def test_a_forked_process_makes_threads_of_its_own():
     subprocess.run([sys.executable, "-c", FORK], check=True, timeout=100)
 
 
+END = """
+from headvox.machine.threads import Threads
+
+threads = Threads(3)
+frame = threads.awake()
+{}
+threads.run(print, [(0,), (1,), (2,)])
+"""
+
+
+@pytest.mark.parametrize("midway", ["", "frame.__enter__()"])
+def test_a_process_ends_whatever_its_threads_wait_for(midway):
+    done = subprocess.run(
+        [sys.executable, "-c", END.format(midway)], capture_output=True, text=True, check=True, timeout=100
+    )
+    assert sorted(done.stdout.split()) == ["0", "1", "2"]
+    assert done.stderr == ""
+
+
 def test_what_is_taken_is_taken_once():
     threads, counts, taken = Threads(2), np.zeros(1, np.int64), np.zeros(1_000_000, np.int64)
     threads.run(take_all, [(counts, taken), (counts, taken)])

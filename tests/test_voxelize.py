@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from headvox.data import Cloud, DepthImage, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
+from headvox.machine.threads import new_blocks
 from headvox.voxelize import (
     ROWS,
     Lattice,
@@ -17,7 +18,6 @@ from headvox.voxelize import (
     Rays,
     mark_depth,
     mark_points,
-    new_blocks,
     new_box,
     part_transform,
     voxelize_depth,

@@ -14,11 +14,13 @@ import numpy.typing as npt
 
 from headvox.integral import Integral, box_reach, set_corners, with_margins
 from headvox.machine.kernels import bare_kernel, rule
-from headvox.machine.simd import LANES, add, fill, less, load, lowest, sub, times, within
+from headvox.machine.simd import LANES, add, equal, fill, less, load, lowest, sub, times, within
+from headvox.machine.threads import new_blocks, take
 from headvox.masks.compile import CompiledGate
 
 SLICES = 4
 ALL = np.uint32(0xFFFFFFFF)
+FIRSTS = np.uint32(0x55555555)  # of each pair of bits
 
 
 @rule
@@ -61,23 +63,27 @@ def holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[n
 
 @bare_kernel
 def gate_columns(  # type: ignore[no-untyped-def]
-    S, region, weights, spans, rank, limits, spacing, odd, corners, passed
+    S, region, shift, weights, spans, rank, limits, spacing, odd, corners, blocks, passed
 ):
-    """Write to ``passed`` (nx, ny, words a column) a bit for each voxel of ``region``: whether it passes.
+    """Write to ``passed`` (slices, ny, words a column) a bit for each voxel of ``region``: whether it passes.
 
     The bits of a word are for every other voxel, from 64 k on in word 2 k of a column, from 64 k + 1 on in the next.
     ``region`` is x0 x1 y0 y1 z0 z1; S, in halves, has margins about it, see
-    :func:`headvox.integral.shape_with_margins`. With ``odd`` (3,) added to x, y and z, all voxels count (``spacing``
-    1), those whose x + y + z is even (2), or those whose x, y and z are all even or all odd (4). ``corners`` are those
-    of the gate's boxes.
+    :func:`headvox.integral.shape_with_margins`. As many slices of it as there are in ``passed`` are looked at, from the
+    one on that is ``shift`` behind the first; S begins as much later. With ``odd`` (3,) added to x, y and z of the
+    region, all voxels count (``spacing`` 1), those whose x + y + z is even (2), or those whose x, y and z are all even
+    or all odd (4). ``corners`` are those of the gate's boxes. Slices are taken :data:`SLICES` at a time by whichever
+    thread is free: ``blocks`` (1,) counts what was taken.
     """
-    flat = S.reshape(-1)
+    flat, odd_x = S.reshape(-1), odd[0] + shift
     x0, y0, bottom, height = region[0], region[2], region[4], region[5] - region[4]
-    odd_column, odd_z = odd[0] + odd[1], (odd[0] if spacing == 4 else odd[0] + odd[1]) + odd[2] + bottom
+    odd_column, odd_z = odd_x + odd[1], (odd_x if spacing == 4 else odd_x + odd[1]) + odd[2] + bottom
+    end = x0 + passed.shape[0]
     # A few slices go side by side, because they share most of what their boxes look up.
-    for block in range(x0, region[1], SLICES):
+    block = x0 + SLICES * take(blocks, 0)
+    while block < end:
         for y in range(y0, region[3]):
-            for x in range(block, min(block + SLICES, region[1])):
+            for x in range(block, min(block + SLICES, end)):
                 column = (x * S.shape[1] + y) * S.shape[2]
                 words = passed[np.uint64(x - x0), np.uint64(y - y0)]
                 first, after = 0, 2  # the words of a pair that have candidates
@@ -95,6 +101,7 @@ def gate_columns(  # type: ignore[no-untyped-def]
                             at = column + ((bottom + z) >> 1), -((bottom + z) & 1)
                             alive &= holds(flat, at, corners, weights, spans, rank, limits, i)
                         words[np.uint64(pair + k)] = alive
+        block = x0 + SLICES * take(blocks, 0)
 
 
 @rule
@@ -110,24 +117,36 @@ def list_passed(passed, region, survivors):  # type: ignore[no-untyped-def]
     Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
     """
     words, found = passed.reshape(-1), 0
-    for at in range(0, words.shape[0], 2):
-        evens, odds = words[np.uint64(at)], words[np.uint64(at + 1)]
-        bits = evens | odds
-        if bits == 0:  # almost everywhere
-            continue
-        column, k = divmod(at, passed.shape[2])
-        x, y = divmod(column, passed.shape[1])
-        while bits:
-            lane = lowest(bits)
-            bits &= bits - np.uint32(1)
-            for j in range(2):
-                if (odds if j else evens) >> np.uint32(lane) & np.uint32(1):
-                    if found < survivors.shape[0]:
-                        survivors[found, 0] = region[0] + x
-                        survivors[found, 1] = region[2] + y
-                        survivors[found, 2] = region[4] + LANES * k + 2 * lane + j
-                    found += 1
+    for first in range(0, words.shape[0], LANES):
+        pairs = _pairs_with_any(words, first)
+        while pairs:  # almost nowhere
+            at = first + lowest(pairs)
+            pairs &= pairs - np.uint32(1)
+            column, k = divmod(at, passed.shape[2])
+            x, y = divmod(column, passed.shape[1])
+            evens, odds = words[np.uint64(at)], words[np.uint64(at + 1)]
+            bits = evens | odds
+            while bits:
+                lane = lowest(bits)
+                bits &= bits - np.uint32(1)
+                for j in range(2):
+                    if (odds if j else evens) >> np.uint32(lane) & np.uint32(1):
+                        if found < survivors.shape[0]:
+                            survivors[found, 0] = region[0] + x
+                            survivors[found, 1] = region[2] + y
+                            survivors[found, 2] = region[4] + LANES * k + 2 * lane + j
+                        found += 1
     return found
+
+
+@rule
+def _pairs_with_any(words, first):  # type: ignore[no-untyped-def]
+    """Return a bit for the first of each pair of :data:`LANES` words from ``first`` on: whether any bit is set."""
+    if first + LANES > words.shape[0]:  # the last few: they are looked at in any case
+        return lowest_bits(words.shape[0] - first) & FIRSTS
+    some = load(words, first)
+    bits = ~equal(some, sub(some, some))
+    return (bits | bits >> np.uint32(1)) & FIRSTS
 
 
 def candidate_reach(gate: CompiledGate) -> npt.NDArray[np.int64]:
@@ -182,7 +201,7 @@ def pass_gate(S: Integral, gate: CompiledGate, odd: npt.ArrayLike = (0, 0, 0)) -
     set_corners(longer, gate.boxes, corners)
     tables = gate_tables(gate, S.dtype)
     at = gate.spacing, np.asarray(odd) + low
-    gate_columns(longer, region, *tables, *at, corners, passed)
+    gate_columns(longer, region, 0, *tables, *at, corners, new_blocks(1)[0], passed)
     survivors = np.empty((sum(int(bits).bit_count() for bits in passed[passed > 0]), 3), np.int32)
     list_passed(passed, region, survivors)
     return survivors - low.astype(np.int32)

@@ -20,7 +20,7 @@ from headvox.refine import MOST_PARTS, ROWS
 from headvox.slabs import Slabs, cut
 from headvox.visibility import cells_of
 from headvox.vote import StageTables, seen_boxes
-from headvox.voxelize import Lattice, Marking, empty
+from headvox.voxelize import Lattice, Marking
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
@@ -38,6 +38,8 @@ class Memory:
         self.dirty: tuple[int, int] | None = (0, 0)
         self.grids = _touched((threads, room_for(math.prod(lattice.shape))), cell_type)
         """The cells as each thread entered them, see :func:`headvox.integral.integrate`."""
+        self.boxes = np.empty((threads, 6), np.int64)
+        """What cells each thread entered: lowest and highest in x, y, z."""
         self.marking = [Marking.of(LANES) for _ in range(threads)]
         tables = [part.boxes for part in (cascade.gate, cascade.stages, cascade.votes) if part is not None]
         if cascade.votes is not None:
@@ -66,21 +68,29 @@ class Memory:
         self.scores: I64 = np.empty(0, np.int64)
         self.make_room(4096)
 
-    def clear(self, part: int, dirty: tuple[int, int] | None) -> None:
-        """Empty a thread's grid, of which the slices ``dirty`` are not: all, if a frame was interrupted midway.
-
-        It does so just before it marks the cells: they are in its cache then.
-        """
+    def used(self, grid: npt.NDArray[Any], dirty: tuple[int, int] | None) -> npt.NDArray[Any]:
+        """Return the part of a ``grid`` in the slices ``dirty``: all of it, if a frame was interrupted midway."""
         if dirty is None:
-            empty(self.grids[part])
-        else:
-            a_slice = math.prod(self.lattice.shape[1:])
-            empty(self.grids[part, dirty[0] * a_slice : dirty[1] * a_slice])
+            return grid
+        a_slice = math.prod(self.lattice.shape[1:])
+        return grid[dirty[0] * a_slice : dirty[1] * a_slice]
 
     def cut(self, slices: int, threads: int) -> Slabs:
         """Cut the volume about so many ``slices`` of candidates into slabs."""
         self.slabs = cut(slices, int(self.reach[0]), int(self.reach[1]), threads)
         return self.slabs
+
+    def volume_about(self, candidates: I64, threads: int) -> npt.NDArray[Any]:
+        """Return room for the integral volume about the box ``candidates``, in a slab for each of ``threads``.
+
+        It has margins for whatever box is looked up there.
+        """
+        slices, *rest = (candidates[3:] - candidates[:3] + 1).tolist()
+        slabs = self.cut(slices, threads)
+        shape = (slabs.slices, *shape_with_margins((slices, *rest), self.reach)[1:])
+        self.first = candidates[:3] + self.reach[0::2]
+        S: npt.NDArray[Any] = self.S[: math.prod(shape)].reshape(shape)
+        return S
 
     def candidates_about(self, occupied: I64) -> I64:
         """Return the box of cells that may pass the gate, lowest and highest, where these are occupied."""

@@ -19,11 +19,11 @@ from headvox.cuda.device import BATCH, DeviceLost, use_device
 from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
-from headvox.integral import integrate, set_corners, shape_with_margins
+from headvox.integral import integrate, set_corners
 from headvox.keep import asks_cameras, keep, least_score, slack_of
 from headvox.machine.clock import Clock
 from headvox.machine.kernels import read_only
-from headvox.machine.threads import Threads
+from headvox.machine.threads import Threads, new_blocks
 from headvox.masks.compile import SCORE_UNIT, compile_cascade
 from headvox.masks.read import load_cascade
 from headvox.memory import Memory, Stages
@@ -34,15 +34,12 @@ from headvox.slabs import shares_of
 from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, best_of_each, local_maxima
 from headvox.visibility import count_states, look_about
 from headvox.vote import DROPPED, vote_masks, vote_stages
-from headvox.voxelize import (
-    mark_depth,
-    mark_points,
-    new_blocks,
-    new_box,
-)
+from headvox.voxelize import NO_BOX, empty, join_boxes, mark_depth, mark_points
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
+
+Loop = tuple[Callable[..., None], tuple[Any, ...]]
 
 STAGES = ("voxelize", "integral", "gate", "vote", "suppress", "judge", "refine")
 FEW = 128
@@ -130,9 +127,8 @@ class Detector:
             occupied = self._voxelize(frame, memory)
             clock.done("voxelize")
             candidates = memory.candidates_about(occupied)
-            S = self._integrate(memory, occupied, candidates)
-            clock.done("integral")
-            survivors = self._gate(S, candidates, memory)
+            S = memory.volume_about(candidates, self._threads.count)
+            survivors = self._gate(S, occupied, candidates, memory, clock)
             clock.done("gate")
             scores = self._vote(S, survivors, memory)
             clock.done("vote")
@@ -194,69 +190,69 @@ class Detector:
 
     def _voxelize(self, frame: Frame, memory: Memory) -> I64:
         """Enter every reading into the grid; return its lowest and highest occupied cell."""
-        lattice, parts = memory.lattice, self._threads.count
-        limits, shape, shift = memory.limits, lattice.shape, lattice.subdivision - 1
-        counting = self.cascade.source.counting
-        boxes = [new_box() for _ in range(parts)]
-        transforms = [self._placing.transform(cloud, lattice) for cloud in frame.clouds]
-        views = [self._placing.view(image, lattice) for image in frame.depths]
+        lattice, boxes, counting = memory.lattice, memory.boxes, self.cascade.source.counting
+        boxes[:] = NO_BOX
         memory.make_room_for_width(max((image.depth.shape[1] for image in frame.depths), default=0))
-
-        blocks = new_blocks(len(frame.clouds) + len(frame.depths))
+        common = (memory.limits, memory.bits, lattice.shape, lattice.subdivision - 1, counting)
+        clouds = [
+            (read_only(cloud.points), self._placing.transform(cloud, lattice)) for cloud in frame.clouds
+        ]
+        images = [(read_only(image.depth), self._placing.rays(image, lattice)) for image in frame.depths]
+        blocks = new_blocks(len(clouds) + len(images))
         dirty, memory.dirty = memory.dirty, None
 
-        def mark(part: int) -> None:
-            memory.clear(part, dirty)
-            common = (limits, memory.bits, shape, shift, counting)
-            cells, marking, box = memory.grids[part], memory.marking[part], boxes[part]
-            for cloud, T, taken in zip(frame.clouds, transforms, blocks, strict=False):
-                mark_points(read_only(cloud.points), taken, T, *common, *marking.for_points(), box, cells)
-            for image, (rays, _), taken in zip(frame.depths, views, blocks[len(frame.clouds) :], strict=True):
-                depth, room = read_only(image.depth), marking.for_depth(image.depth.shape[1])
-                mark_depth(depth, taken, rays.column, rays.row, rays.t, *common, *room, box, cells)
-
-        self._threads.run(mark, [(part,) for part in range(parts)])
-        box = boxes[0]
-        for other in boxes[1:]:
-            box[:3], box[3:] = np.minimum(box[:3], other[:3]), np.maximum(box[3:], other[3:])
-        memory.dirty = (max(int(box[0]), 0), int(box[3]) + 1)
-        if box[3] < 0:
+        # All that the loops need is made before, so that no thread waits for the GIL while another makes it.
+        calls = []
+        for grid, marking, box in zip(memory.grids, memory.marking, boxes, strict=True):
+            loops: list[Loop] = [(empty, (memory.used(grid, dirty),))]
+            for (points, T), taken in zip(clouds, blocks, strict=False):
+                loops.append((mark_points, (points, taken, T, *common, *marking.for_points(), box, grid)))
+            for (depth, rays), taken in zip(images, blocks[len(clouds) :], strict=True):
+                pixels = (depth, taken, rays.column, rays.row, rays.t)
+                loops.append((mark_depth, (*pixels, *common, *marking.for_depth(depth.shape[1]), box, grid)))
+            calls.append((loops,))
+        self._threads.run(_run_loops, calls)
+        join_boxes(boxes)
+        occupied: I64 = boxes[0]
+        memory.dirty = (max(int(occupied[0]), 0), int(occupied[3]) + 1)
+        if occupied[3] < 0:
             memory.dirty = (0, 0)
             raise nothing_in_range(frame, lattice.region)
-        return box
+        return occupied
 
-    def _integrate(self, memory: Memory, occupied: I64, candidates: I64) -> npt.NDArray[Any]:
-        """Return the integral volume about the box ``candidates``, with margins for whatever box is looked up there."""
-        slices, *rest = (candidates[3:] - candidates[:3] + 1).tolist()
-        slabs = memory.cut(slices, self._threads.count)
-        shape = (slabs.slices, *shape_with_margins((slices, *rest), memory.reach)[1:])
-        S: npt.NDArray[Any] = memory.S[: math.prod(shape)].reshape(shape)
-        memory.first = candidates[:3] + memory.reach[0::2]
-        common = (memory.grids, memory.lattice.shape, occupied)
-        counting = self.cascade.source.counting
-        calls = [
-            (*common, memory.first + slab.shift, counting, row, S[slab.slices])
-            for slab, row in zip(slabs.each, memory.row, strict=False)
-        ]
-        self._threads.run(integrate, calls)
-        return S
-
-    def _gate(self, S: npt.NDArray[Any], candidates: I64, memory: Memory) -> I32:
-        low, high = candidates[:3] - memory.first, candidates[3:] - memory.first + 1
+    def _gate(self, S: npt.NDArray[Any], occupied: I64, candidates: I64, memory: Memory, clock: Clock) -> I32:
+        """Fill the integral volume ``S``, and return the voxels of it that pass the gate."""
         region = np.empty(6, np.int64)
-        region[0::2], region[1::2] = low, high
+        region[0::2], region[1::2] = candidates[:3], candidates[3:] + 1
+        region -= memory.first.repeat(2)
         shape = shape_of_passed(region)
         passed = memory.passed[: math.prod(shape)].reshape(shape)
-        odd = memory.odd + memory.first
         set_corners(S, self.cascade.gate.boxes, memory.gate_corners)
-        common, calls = (*memory.gate, self.cascade.gate.spacing), []
-        for slab in memory.slabs.each:
-            part = region.copy()
-            part[1] = part[0] + slab.end - slab.first
-            bits = passed[slab.first : slab.end]
-            calls.append((S[slab.slices], part, *common, odd + slab.shift, memory.gate_corners, bits))
-        # The slab that a thread has added up: it is in its own cache.
-        self._threads.run(gate_columns, calls)
+        cells = (memory.grids, memory.lattice.shape, occupied)
+        counting, odd = self.cascade.source.counting, memory.odd + memory.first
+        gate = (*memory.gate, self.cascade.gate.spacing, odd, memory.gate_corners)
+        slabs = memory.slabs.each
+        sums = [
+            (*cells, memory.first + slab.shift, counting, row, S[slab.slices])
+            for slab, row in zip(slabs, memory.row, strict=False)
+        ]
+        gates = [
+            (S[slab.slices], region, slab.first, *gate, taken, passed[slab.first : slab.end])
+            for slab, taken in zip(slabs, new_blocks(len(slabs)), strict=True)
+        ]
+        summed = [False] * len(slabs)
+
+        def search(own: int) -> None:
+            integrate(*sums[own])
+            summed[own] = True
+            if own == 0:
+                clock.done("integral")
+            # First the slab that the thread has added up, which is in its own cache; then what others still have.
+            for slab in (*range(own, len(slabs)), *range(own)):
+                if summed[slab]:
+                    gate_columns(*gates[slab])
+
+        self._threads.run(search, [(own,) for own in range(len(slabs))])
         self.candidates = list_passed(passed, region, memory.survivors)
         if self.candidates > len(memory.survivors):
             memory.survivors = np.empty((2 * self.candidates, 3), np.int32)
@@ -420,6 +416,11 @@ class Detector:
         if memory.lattice is not lattice:
             memory.place(lattice)
         return memory
+
+
+def _run_loops(loops: Sequence[Loop]) -> None:
+    for loop, arguments in loops:
+        loop(*arguments)
 
 
 def _warn(text: str) -> None:

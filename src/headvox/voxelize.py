@@ -45,10 +45,11 @@ from headvox.machine.simd import (
     to_int,
     where,
 )  # fmt: skip
-from headvox.machine.threads import take
+from headvox.machine.threads import new_blocks, take
 
 NOWHERE = np.int32(-1)
 FARTHEST = np.int32(2**31 - 1)
+NO_BOX = np.repeat(np.array([FARTHEST, NOWHERE], np.int64), 3)
 MOST_CELLS = 1 << 28  # a cell's number and its part fit an int32
 MOST_BITS = 32  # and so do a part's x, y and z side by side
 ALL = np.uint32(0xFFFFFFFF)
@@ -130,14 +131,9 @@ class Lattice:
         return centres
 
 
-def new_box() -> npt.NDArray[np.int64]:
+def new_box() -> I64:
     """Return an empty box of cells: lowest and highest in x, y, z."""
-    return np.array([FARTHEST, FARTHEST, FARTHEST, NOWHERE, NOWHERE, NOWHERE], dtype=np.int64)
-
-
-def new_blocks(readings: int) -> npt.NDArray[np.int64]:
-    """Return how many blocks were taken of each reading: (readings, 1)."""
-    return np.zeros((readings, 1), np.int64)
+    return NO_BOX.copy()
 
 
 @rule
@@ -313,6 +309,15 @@ def mark_depth(  # type: ignore[no-untyped-def]
                     count = 0
         first = ROWS * take(blocks, 0)
     enter(new, count, bits, shape, shift, counting, box, few_codes, cells)
+
+
+@bare_kernel
+def join_boxes(boxes):  # type: ignore[no-untyped-def]
+    """Widen the first of ``boxes`` (N, 6) by the others."""
+    for box in range(1, boxes.shape[0]):
+        for k in range(3):
+            boxes[0, k] = min(boxes[0, k], boxes[box, k])
+            boxes[0, 3 + k] = max(boxes[0, 3 + k], boxes[box, 3 + k])
 
 
 @bare_kernel

@@ -1,8 +1,9 @@
 """Threads that share a frame: they wait for the next loop awake while a frame is searched, and sleep between frames.
 
 A frame is a chain of loops of a fraction of a millisecond each, and waking a thread that sleeps takes a tenth of one.
-So the threads that help look at a flag in memory, in compiled code and without the GIL, until the next loop begins;
-and the caller so waits for them. Both offer their core to whoever else wants it all the while. A call goes to whoever
+So the threads that help are woken when the frame begins, and look at a flag in memory until the next loop does; and the
+caller so waits for them. All this waiting is in compiled code and without the GIL, which a thread asks for only when
+there is a call for it to make. Both offer their core to whoever else wants it all the while. A call goes to whoever
 is free: where there is no core for a second thread, the caller makes all calls and does not wait.
 """
 
@@ -11,7 +12,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from queue import SimpleQueue
 from threading import Thread
 from typing import Any, NamedTuple
 from weakref import finalize
@@ -27,11 +27,17 @@ from headvox.machine.simd import intrinsic
 I64 = npt.NDArray[np.int64]
 
 LINE = 8  # what different threads write is a cache line apart
-TAKEN, ENDED = 0, LINE
+BEGUN, RUNG = 0, LINE  # flags: the turn that goes on, and the one that the threads were last woken after,
+NEVERMORE = -1  # or this, when there will be none
+TAKEN, ENDED = 0, LINE  # counts
 LOOKS = 64  # at a flag, before the core is offered to others
 GRACE = 45  # offers of the core, some 10 us, after which the caller is in its loop and has let go of the GIL
 PATIENCE = 100_000  # offers of the core, some 30 ms
 _offer_core = types.ExternalFunction("SwitchToThread" if os.name == "nt" else "sched_yield", types.int32())
+# Python's own locks, as it has them for C: on every system, and without the GIL.
+_new_lock: Any = types.ExternalFunction("PyThread_allocate_lock", types.intp())
+_acquire: Any = types.ExternalFunction("PyThread_acquire_lock", types.intc(types.intp, types.intc))
+_release: Any = types.ExternalFunction("PyThread_release_lock", types.void(types.intp))
 
 
 @intrinsic
@@ -73,6 +79,11 @@ def take(counts, at):  # type: ignore[no-untyped-def]
     return _add(counts, at, 1)
 
 
+def new_blocks(things: int) -> I64:
+    """Return how many blocks were taken of each of several things, for :func:`take`: (things, 1), still none."""
+    return np.zeros((things, 1), np.int64)
+
+
 def _address(context: Any, builder: Any, signature: Any, arguments: Any) -> ir.Value:
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
     at = context.cast(builder, arguments[1], signature.args[1], types.intp)
@@ -81,19 +92,44 @@ def _address(context: Any, builder: Any, signature: Any, arguments: Any) -> ir.V
 
 
 @bare_kernel
-def begin(flags, turn):  # type: ignore[no-untyped-def]
-    """Tell the others that it is their ``turn``."""
-    _tell(flags, 0, turn)
+def new_alarm():  # type: ignore[no-untyped-def]
+    """Return a lock that is held: who asks for it sleeps until it rings. It is never freed: it is some 40 bytes."""
+    alarm = _new_lock()
+    _acquire(alarm, 1)
+    return alarm
 
 
 @bare_kernel
-def wait_for_turn(flags, turn, counts, made):  # type: ignore[no-untyped-def]
-    """Say that as many calls were ``made``, and wait for the caller to say that it is this ``turn``, or a later one."""
+def ring(alarm, flags, turn):  # type: ignore[no-untyped-def]
+    """Wake a thread for what comes after ``turn``, or to end it (:data:`NEVERMORE`)."""
+    _tell(flags, RUNG, turn)
+    _release(alarm)
+
+
+@bare_kernel
+def begin(flags, turn):  # type: ignore[no-untyped-def]
+    """Tell the others that it is their ``turn``."""
+    _tell(flags, BEGUN, turn)
+
+
+@bare_kernel
+def wait_for_turn(flags, alarm, asleep, turn, counts, made):  # type: ignore[no-untyped-def]
+    """Say that as many calls were ``made``, and wait for the caller to say that it is this ``turn``, or a later one.
+
+    Who is ``asleep`` waits for its ``alarm`` first. Return False if there will be no more turns.
+    """
     # One loop, so that the caller, who then goes on, finds the GIL free.
     _add(counts, ENDED, made)
-    _wait(flags, 0, turn)
+    while asleep:
+        _acquire(alarm, 1)
+        rung = _told(flags, RUNG)
+        if rung == NEVERMORE:
+            return False
+        asleep = rung < turn - 1  # it was still awake when it was to be woken
+    _wait(flags, BEGUN, turn)
     for _ in range(GRACE):
         _offer_core()
+    return True
 
 
 @bare_kernel
@@ -139,9 +175,9 @@ class _Shared:
     """What the threads know of each other: they must not hold the :class:`Threads`, which end when nobody does."""
 
     def __init__(self, count: int) -> None:
-        self.flags: I64 = np.zeros(LINE, np.int64)
+        self.flags: I64 = np.zeros(2 * LINE, np.int64)
         self.task = _task(0, None, ())
-        self.alarms: list[SimpleQueue[int | None]] = [SimpleQueue() for _ in range(1, count)]
+        self.alarms: list[int] = [new_alarm() for _ in range(1, count)]
 
 
 class Threads:
@@ -161,7 +197,7 @@ class Threads:
         ]
         for thread in self._others:
             thread.start()
-        self._end = finalize(self, _ring, self._shared, None)
+        self._end = finalize(self, _ring, self._shared, NEVERMORE)
 
     @contextmanager
     def awake(self) -> Iterator[None]:
@@ -213,19 +249,15 @@ class Threads:
         self._others = []
 
 
-def _ring(shared: _Shared, turn: int | None) -> None:
-    """Wake the threads for what comes after ``turn``, or end them."""
+def _ring(shared: _Shared, turn: int) -> None:
     for alarm in shared.alarms:
-        alarm.put(turn)
+        ring(alarm, shared.flags, turn)
 
 
-def _serve(shared: _Shared, alarm: SimpleQueue[int | None]) -> None:
-    done, counts, made = 0, np.zeros(2 * LINE, np.int64), 0
-    while (turn := alarm.get()) is not None:
-        asleep = turn < done  # it was still awake when it was to be woken
-        while not asleep:
-            wait_for_turn(shared.flags, done + 1, counts, made)
-            done, counts, made, asleep = _take_turn(shared.task)
+def _serve(shared: _Shared, alarm: int) -> None:
+    done, counts, made, asleep = 0, np.zeros(2 * LINE, np.int64), 0, True
+    while wait_for_turn(shared.flags, alarm, asleep, done + 1, counts, made):
+        done, counts, made, asleep = _take_turn(shared.task)
 
 
 def _take_turn(task: _Task) -> tuple[int, I64, int, bool]:

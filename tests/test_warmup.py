@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -129,3 +130,22 @@ def test_the_other_process_compiles_the_fit_for_all_that_a_detector_hands_it() -
     warm_up(DetectorConfig())
     assert done.stdout.strip() == str(sorted(map(str, warmup.search.signatures)))
     assert warmup.search.signatures
+
+
+def test_a_warm_up_that_is_interrupted_ends_the_other_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Sleeper(subprocess.Popen[bytes]):
+        def __init__(self, command: list[str], **named: int) -> None:
+            super().__init__([command[0], "-c", "import time; time.sleep(600)"], **named)
+            started.append(self)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(warmup, "_is_kept", lambda kernel: False)
+    monkeypatch.setattr(warmup.subprocess, "Popen", Sleeper)
+    monkeypatch.setattr(warmup, "_search", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        warm_up(DetectorConfig())
+    assert [process.wait(10.0) for process in started] == [-signal.SIGTERM]

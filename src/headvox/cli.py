@@ -38,6 +38,7 @@ from headvox.commands.flags import (
 )
 from headvox.commands.table import printable, table
 from headvox.errors import HeadvoxError, Undecided
+from headvox.machine.interrupts import heeded
 from headvox.parallel.workers import add_flags, of_flags
 from headvox.render import command as render_command
 from headvox.sinks import SUFFIXES
@@ -81,7 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     try:
-        code = _dispatch(arguments)
+        with heeded():
+            code = _dispatch(arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:
         return INTERRUPTED

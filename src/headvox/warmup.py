@@ -47,9 +47,13 @@ def warm_up(config: DetectorConfig) -> None:
     if config.refine == "pose" and not _is_kept(search):
         nothing = subprocess.DEVNULL  # what it cannot compile is compiled here, and told here
         command = [sys.executable, "-m", "headvox.warmup"]
-        with subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing):
-            _search(replace(tiny, refine="sphere"), voxel)
-            _follow()
+        with subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing) as other:
+            try:
+                _search(replace(tiny, refine="sphere"), voxel)
+                _follow()
+            except BaseException:
+                other.terminate()
+                raise
     _search(tiny, voxel)
     _follow()
 

@@ -26,6 +26,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from headvox.data import Frame
 from headvox.errors import HeadvoxError
+from headvox.machine.interrupts import heeded
 from headvox.ros.messages import info_topic
 from headvox.ros.synchronise import Reading, Synchroniser
 from headvox_ros.parameters import Parameter
@@ -296,8 +297,9 @@ def run(make: Callable[[], SensorNode], arguments: Sequence[str] | None = None) 
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         try:
-            if node.get_parameter("autostart").value and not _start(node):
-                return 1
+            with heeded():  # it may compile for a minute
+                if node.get_parameter("autostart").value and not _start(node):
+                    return 1
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: end.set())
             while not end.is_set() and not node.failed:

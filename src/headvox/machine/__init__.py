@@ -1,1 +1,1 @@
-"""What the stages run on: compiled loops, vectors, threads, clocks."""
+"""What the stages run on: compiled loops, vectors, threads, clocks, interrupts."""

@@ -1,0 +1,59 @@
+import ctypes
+import sys
+import time
+
+import pytest
+
+from headvox.machine.interrupts import AGAIN_S, heeded
+
+
+class Finalized:
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+def finalizer():
+    Finalized()
+
+
+@ctypes.CFUNCTYPE(None)
+def callback():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("swallows", [finalizer, callback], ids=["finalizer", "callback"])
+def test_an_interrupt_that_is_swallowed_comes_again(swallows, capsys):
+    def work():
+        with heeded():
+            swallows()
+            time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert capsys.readouterr().err == ""
+
+
+def test_other_errors_are_told_as_before(monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: told.append(unraisable.exc_type))
+    before = sys.unraisablehook
+
+    @ctypes.CFUNCTYPE(None)
+    def fails():
+        raise ValueError
+
+    with heeded():
+        fails()
+    assert told == [ValueError]
+    assert sys.unraisablehook is before
+
+
+def test_what_breaks_down_because_of_it_was_interrupted():
+    def work():
+        with heeded():
+            finalizer()
+            raise ValueError
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    time.sleep(3 * AGAIN_S)  # and no second one comes

@@ -27,7 +27,8 @@ from headvox.machine.simd import intrinsic
 I64 = npt.NDArray[np.int64]
 
 LINE = 8  # what different threads write is a cache line apart
-BEGUN, RUNG = 0, LINE  # flags: the turn that goes on, and the one that the threads were last woken after,
+BEGUN, RESTED = 0, LINE  # flags: the turn that goes on, the last one that sent the threads to sleep,
+RUNG = 2 * LINE  # and the one that they were last woken after,
 NEVERMORE = -1  # or this, when there will be none
 TAKEN, ENDED = 0, LINE  # counts
 LOOKS = 64  # at a flag, before the core is offered to others
@@ -107,8 +108,10 @@ def ring(alarm, flags, turn):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def begin(flags, turn):  # type: ignore[no-untyped-def]
-    """Tell the others that it is their ``turn``."""
+def begin(flags, turn, to_sleep):  # type: ignore[no-untyped-def]
+    """Tell the others that it is their ``turn``, or that in this one they are to sleep."""
+    if to_sleep:
+        _tell(flags, RESTED, turn)
     _tell(flags, BEGUN, turn)
 
 
@@ -118,15 +121,20 @@ def wait_for_turn(flags, alarm, asleep, turn, counts, made):  # type: ignore[no-
 
     Who is ``asleep`` waits for its ``alarm`` first. Return False if there will be no more turns.
     """
-    # One loop, so that the caller, who then goes on, finds the GIL free.
+    # One loop, so that the caller, who then goes on, finds the GIL free; and so does a frame that follows at once.
     _add(counts, ENDED, made)
-    while asleep:
-        _acquire(alarm, 1)
-        rung = _told(flags, RUNG)
-        if rung == NEVERMORE:
-            return False
-        asleep = rung < turn - 1  # it was still awake when it was to be woken
-    _wait(flags, BEGUN, turn)
+    begun = False
+    while not begun:
+        while asleep:
+            _acquire(alarm, 1)
+            rung = _told(flags, RUNG)
+            if rung == NEVERMORE:
+                return False
+            asleep = rung < turn - 1  # it was still awake when it was to be woken
+        _wait(flags, BEGUN, turn)
+        begun = _told(flags, RESTED) < _told(flags, BEGUN)
+        if not begun:
+            asleep, turn = True, _told(flags, RESTED) + 1
     for _ in range(GRACE):
         _offer_core()
     return True
@@ -175,7 +183,7 @@ class _Shared:
     """What the threads know of each other: they must not hold the :class:`Threads`, which end when nobody does."""
 
     def __init__(self, count: int) -> None:
-        self.flags: I64 = np.zeros(2 * LINE, np.int64)
+        self.flags: I64 = np.zeros(3 * LINE, np.int64)
         self.task = _task(0, None, ())
         self.alarms: list[int] = [new_alarm() for _ in range(1, count)]
 
@@ -214,7 +222,7 @@ class Threads:
             yield
         finally:
             self._awake = False
-            begin(self._shared.flags, self._hand_out(None, ()).turn)
+            begin(self._shared.flags, self._hand_out(None, ()).turn, True)
 
     def run(self, function: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> None:
         """Call ``function`` with each of ``calls``; returns, or raises, when all have ended."""
@@ -226,7 +234,7 @@ class Threads:
             task = self._hand_out(function, calls)
             made = 0
             try:
-                begin(self._shared.flags, task.turn)
+                begin(self._shared.flags, task.turn, False)
                 made = _do_share(task)
             finally:
                 while not join(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import naive_kalman as kalman
 import naive_track as naive
 import numpy as np
 import pytest
 
 from headvox.tracking import identity, noise
-from headvox.tracking.lifetime import ELSEWHERE, age, judge_new, missing, turn_page
+from headvox.tracking.lifetime import age, judge_new, turn_page
 from headvox.tracking.roster import blank
+from headvox.visibility import OUT_OF_VIEW, SEEN_EMPTY
 
 NOW_NS, BEFORE_NS = 10_000_000_000, 9_900_000_000
 
@@ -119,13 +119,14 @@ def test_the_scatter_is_that_of_the_noise_and_not_of_the_way():
 
 def test_ages_equal_the_plain_ones():
     rng = np.random.default_rng(9)
-    lasts_s = np.array([0.5, 1.0, 3.0, np.inf, 0.3, np.inf])
+    lasts_s = np.array([0.5, 1.0, 3.0, np.inf, 0.3])
     roster = some_tracks(rng, 200)
     roster["life"][:], roster["trust"][:] = rng.uniform(0.1, 1.0, (2, 200))
     roster["strength"][:] = rng.uniform(0.2, 1.0, 200)
     roster["seen_ns"][::2] = NOW_NS
     roster["hits"][:] = rng.integers(0, 4, 200)
-    states = rng.integers(0, ELSEWHERE + 1, 200)
+    states = rng.integers(OUT_OF_VIEW, SEEN_EMPTY + 1, 200)
+    roster["absent"][:] = rng.random(200) < 0.5
     before = roster.copy()
     age(roster, NOW_NS, 0.1, states, lasts_s, 3.0, 2.0)
     for n in range(200):
@@ -135,7 +136,7 @@ def test_ages_equal_the_plain_ones():
             seen, sure = before["seen_ns"][n] == NOW_NS, before["hits"][n] & 1
             row = before["life"][n], before["trust"][n], before["strength"][n]
             expected = naive.age(*row, seen, sure, states[n], 0.1, lasts_s, 3.0, 2.0)
-            assert roster["absent"][n] == (not seen and states[n] == ELSEWHERE)
+            assert roster["absent"][n] == (before["absent"][n] and not seen)
             lost = min(expected) <= 0.0
         assert (roster["life"][n], roster["trust"][n]) == pytest.approx(expected)
         assert roster["lost"][n] == lost
@@ -176,16 +177,3 @@ def test_a_page_is_turned():
     assert kept.tolist() == [True, False, True]
     assert roster["hits"].tolist() == [0b00110, 0b11110, 0]
     assert turn_page(roster, NOW_NS, 6, 5, kept)
-
-
-def test_the_missing_are_where_they_are_expected():
-    roster = some_tracks(np.random.default_rng(11), 60)
-    roster["seen_ns"][::3] = NOW_NS
-    rows, places, widths = np.empty(60, np.int64), np.empty((60, 3)), np.empty(60)
-    count = missing(roster, NOW_NS, rows, places, widths)
-    expected = [n for n in range(60) if n % 3 and not roster["lost"][n]]
-    assert rows[:count].tolist() == expected
-    for k, n in enumerate(expected):
-        mean, cov = kalman.mixture(roster["weights"][n], roster["x"][n], roster["P"][n])
-        np.testing.assert_allclose(places[k], mean[:3])
-        assert widths[k] == pytest.approx(np.sqrt(np.trace(cov[:3, :3])))

@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from headvox.machine.kernels import kernel
-from headvox.tracking.kalman import combine, widest
-from headvox.visibility import BEHIND, OUT_OF_VIEW, SEEN_EMPTY
+from headvox.visibility import BEHIND, OUT_OF_VIEW
 
-KNOWN_M = 0.1  # what is known as well as this to be at a place that is seen to be empty is gone: else it is ELSEWHERE,
-VAGUE_M = 0.8  # and so is what may be farther off than this, if no head is seen where it is expected
-ELSEWHERE = SEEN_EMPTY + 1
 WEAK = 1.5  # times that a track trusts weak heads longer than none
 MISS = 0.5  # of a sighting: what speaks against a new head
 MOST_DRAIN = 0.5  # of its life a track loses in one frame, however long: one miss never ends it
@@ -30,39 +26,20 @@ def turn_page(roster, stamp_ns, longest_ns, frames, kept):  # type: ignore[no-un
 
 
 @kernel
-def missing(roster, now_ns, rows, places, widths):  # type: ignore[no-untyped-def]
-    """Write which ``rows`` (N,) are alive and were not seen, their ``places`` (N, 3), and how ``widths`` (N,) wide [m].
-
-    Return how many there are.
-    """
-    mean, cov = np.empty(6), np.empty((6, 6))
-    count = 0
-    for n in range(roster.shape[0]):
-        if roster[n].lost or roster[n].seen_ns == now_ns:
-            continue
-        combine(roster[n], mean, cov)
-        for a in range(3):
-            places[count, a] = mean[a]
-        rows[count], widths[count] = n, widest(cov)
-        count += 1
-    return count
-
-
-@kernel
 def age(roster, now_ns, dt, states, lasts_s, present_s, weak_s):  # type: ignore[no-untyped-def]
     """Let every track that was not surely seen at ``now_ns`` lose life and trust; mark the dead as lost.
 
-    ``states`` (N,) says what was seen of the places of those that were not seen at all, ``lasts_s`` (6,) how long a
+    ``states`` (N,) says what was seen of the places of those that were not seen at all, ``lasts_s`` (5,) how long a
     track lives in each state. One that is missed in plain view loses trust as fast as sure and strong sightings give it
     back, ``present_s`` for the whole of it. One that only weak heads are found for lasts ``weak_s``, and loses trust
-    ``WEAK`` times slower. One that is missed where it may well be ELSEWHERE is absent.
+    ``WEAK`` times slower.
     """
     for n in range(states.shape[0]):
         row = roster[n]
         if row.lost:
             continue
         life_s, trust_s = np.inf, np.inf
-        row.absent = row.seen_ns != now_ns and states[n] == ELSEWHERE
+        row.absent = row.absent and row.seen_ns != now_ns
         if row.seen_ns != now_ns:
             life_s = lasts_s[states[n]]
             if states[n] != OUT_OF_VIEW and states[n] != BEHIND:

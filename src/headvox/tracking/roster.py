@@ -41,7 +41,7 @@ ROW = np.dtype(
 
 ``id``, 0 until confirmed; ``born_ns`` and ``seen_ns``, first and last seen; ``hits``, a bit a frame, the last frame
 lowest; ``life``, 1 when seen, dead at 0; ``trust``, grows while it is seen, shrinks while its place is in plain view
-without it, dead at 0; ``lost``, dead, but remembered; ``absent``, not where it is expected: seen to be empty.
+without it, dead at 0; ``lost``, dead, but remembered; ``absent``, missed in view, and nobody knows where.
 
 ``place`` and ``velocity``, where it was last seen, and how fast; ``height``, its usual height [m], over so many
 ``sightings``; ``radius`` and ``score`` of the last sighting; ``strength``, how well its sightings score.

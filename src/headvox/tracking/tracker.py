@@ -1,9 +1,10 @@
 """From heads to tracks: who is who, where everybody is now, and how fast.
 
 A frame is five steps: predict, associate, correct, age, bear (:meth:`Tracker.update`). The filters are in
-``kalman.py``, what tells people apart in ``identity.py``, how far measured heads may be off in ``noise.py``. What keeps
-a track alive is in ``lifetime.py``: it dies fast where its place is seen to be empty, later where it is hidden. What is
-known of each track is a row of a table (``roster.py``), what is told of it is in ``report.py``.
+``kalman.py``, what tells people apart in ``identity.py``, how far measured heads may be off in ``noise.py``. Where a
+head may be that was not found is in ``unseen.py``, what keeps its track alive in ``lifetime.py``: it dies fast where
+all is seen to be empty, later where it is hidden. What is known of each track is a row of a table (``roster.py``), what
+is told of it is in ``report.py``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections import Counter
 import numpy as np
 
 from headvox.config import TrackerConfig
-from headvox.data import F64, I64, Cloud, Expected, Frame, Heads, Tracks
+from headvox.data import F64, I64, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
 from headvox.tracking.identity import MOST_STRENGTH, come_back, note_sightings, pairs, price
 from headvox.tracking.kalman import (
@@ -26,11 +27,12 @@ from headvox.tracking.kalman import (
     predict_places,
     predict_turns,
 )
-from headvox.tracking.lifetime import ELSEWHERE, KNOWN_M, VAGUE_M, age, judge_new, missing, turn_page
+from headvox.tracking.lifetime import age, judge_new, turn_page
 from headvox.tracking.noise import measurement_noise, widen
 from headvox.tracking.report import expectations, report, tentative
 from headvox.tracking.roster import ROW, Roster, blank
-from headvox.visibility import BEHIND, NO_RETURN, OUT_OF_VIEW, SEEN_EMPTY, SURFACE, see_places
+from headvox.tracking.unseen import search
+from headvox.visibility import BEHIND, NO_RETURN, OUT_OF_VIEW, SEEN_EMPTY
 
 STILL_S, MOVING_S = 8.0, 2.0  # mean times that a head rests and moves
 FIRST_SPEED_M_S = np.array([0.7, 0.7, 0.3])  # standard deviations of the velocity of a head that is new
@@ -85,7 +87,7 @@ class Tracker:
         self._predict(before_ns, frame.stamp_ns)
         tracks, found = self._associate(heads, R_centre)
         self._correct(heads, R_centre, R_turn, tracks, found)
-        self._age(frame, (frame.stamp_ns - before_ns) * 1e-9)
+        self._age(heads.centres, frame, (frame.stamp_ns - before_ns) * 1e-9)
         new = heads.sure.copy()
         new[found] = False
         self._bear(heads, R_centre, R_turn, np.flatnonzero(new))
@@ -161,19 +163,16 @@ class Tracker:
             self.config.strong_score,
         )
 
-    def _age(self, frame: Frame, dt: float) -> None:
-        """Let the tracks that were not surely seen lose life, by what the sensors saw of their places; end the dead."""
+    def _age(self, centres: F64, frame: Frame, dt: float) -> None:
+        """Let the tracks that were not surely seen lose life, by what the sensors saw of their places; end the dead.
+
+        ``centres`` (M, 3) are those of the heads that were found.
+        """
         config, roster = self.config, self._roster
-        n = len(roster)
-        states = np.full(n, OUT_OF_VIEW)
-        rows, places, widths = np.empty(n, np.int64), np.empty((n, 3)), np.empty(n)
-        count = missing(roster, self._now(), rows, places, widths)
-        if count:
-            seen = look_for(frame, places[:count], config.sight_m)
-            least_m = np.where(seen == SEEN_EMPTY, KNOWN_M, VAGUE_M)
-            plain = (seen == SEEN_EMPTY) | (seen == SURFACE)
-            seen[plain & (widths[:count] > least_m)] = ELSEWHERE
-            states[rows[:count]] = seen
+        states = np.full(len(roster), OUT_OF_VIEW)
+        missed = np.flatnonzero(~roster["lost"] & (roster["seen_ns"] != self._now()))
+        if len(missed):
+            states[missed] = search(roster, missed, frame, config.sight_m, centres)
         age(roster, self._now(), dt, states, self._lasts_s, config.present_s, config.weak_s)
         self._confirm()
 
@@ -240,8 +239,8 @@ class Tracker:
 
 
 def _lasts_s(config: TrackerConfig) -> F64:
-    """Return how long a track lives (6,) for each thing that may be seen of its place."""
-    lasts_s = np.full(ELSEWHERE + 1, np.inf)
+    """Return how long a track lives (5,) for each thing that may be seen of its place."""
+    lasts_s = np.full(SEEN_EMPTY + 1, np.inf)
     lasts_s[OUT_OF_VIEW], lasts_s[NO_RETURN] = config.out_of_view_s, config.missed_s
     lasts_s[BEHIND], lasts_s[SEEN_EMPTY] = config.hidden_s, config.empty_s
     return lasts_s
@@ -251,25 +250,3 @@ def _longest_s(config: TrackerConfig) -> float:
     """Return how long any track may be unseen and still be something."""
     limits_s = config.hidden_s, config.present_s, config.missed_s, config.out_of_view_s, config.empty_s
     return max(config.remember_s, *limits_s)
-
-
-def look_for(frame: Frame, places: F64, sight_m: float) -> I64:
-    """Return what the sensors saw of each of ``places`` (N, 3), see :func:`headvox.visibility.see_places`.
-
-    Clouds do not tell which rays came back empty: near their sensor they count as NO_RETURN, and everywhere when nobody
-    knows where that stood. So does a frame without any reading.
-    """
-    states = see_places(frame.depths, places, sight_m)
-    if frame.depths and not frame.clouds:
-        return states
-    near = np.ones(len(places), np.bool_)
-    if frame.clouds and all(cloud.T_world_sensor is not None for cloud in frame.clouds):
-        origins = [_origin(cloud) for cloud in frame.clouds]
-        near = (np.linalg.norm(places[:, None] - np.array(origins), axis=2) <= sight_m).any(axis=1)
-    states[near] = np.maximum(states[near], NO_RETURN)
-    return states
-
-
-def _origin(cloud: Cloud) -> F64:
-    assert cloud.T_world_sensor is not None
-    return cloud.T_world_sensor[:3, 3]

@@ -14,11 +14,13 @@ from headvox.cli import main
 from headvox.data import Cloud, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.evolve import again, bank, boost, gates, samples, search, views
+from headvox.evolve import relief as last_look
 from headvox.evolve.check import Outcome, check
 from headvox.evolve.spoil import spoil
 from headvox.evolve.write import Found, cascade_text, write_cascade
 from headvox.frames import inverse, transform
 from headvox.gate import pass_gate
+from headvox.masks.cascade import cuts
 from headvox.masks.compile import compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade
 from headvox.synth.scene import TrueHead
@@ -320,7 +322,7 @@ def test_heads_that_the_border_cuts_are_heads_to_the_last_stage_and_dummies_neit
     view = easy_view(None, 0, 1)
     view = replace(view, heads=views.Heads(far_apart, visible, clear, posture))
     found = (far_apart[None] + np.array([0.0, 0.2, 0.5])[:, None, None] * [1, 0, 0]).reshape(-1, 3)
-    label, bag = again._label(view, found)
+    label, bag = again.label_places(view, found)
     assert label.tolist() == [1, 1, -1, -1] + [-1] * 4 + [0] * 4
     assert bag.tolist() == [100, 101] + [-1] * 10
 
@@ -351,6 +353,12 @@ def doubtful_peaks(view: views.View, cascade) -> again.Peaks | None:
     if peaks is None or view.number % 3:
         return peaks
     return replace(peaks, samples=replace(peaks.samples, label=0 * peaks.samples.label))
+
+
+def doubtful_looks(view: views.View, cascade) -> last_look.Looks | None:
+    """As :func:`doubtful_peaks`."""
+    looks = last_look.spoilt_looks(view, cascade)
+    return looks if looks is None or view.number % 3 else replace(looks, label=0 * looks.label)
 
 
 def test_the_last_stage_needs_heads_and_others():
@@ -400,3 +408,32 @@ def test_a_camera_whose_image_is_cut_off_before_a_head_does_not_see_it() -> None
     heads = views._heads_of(truth, images, {"near": 2.5, "far": 4.0})
     assert heads.visible.tolist() == [0.9, 0.5, 0.0]
     assert heads.clear.tolist() == [True, True, False]
+
+
+def test_the_last_look_is_fitted_to_spoilt_views_and_written(evolved, monkeypatch):
+    folder, found, _ = evolved
+    monkeypatch.setattr(search, "keep_view", easy_view)
+    monkeypatch.setattr(search, "spoilt_looks", doubtful_looks)
+    monkeypatch.setattr(last_look, "LEAST_ROWS", 5)
+    monkeypatch.setattr(samples, "RANGE_M", 2.8)
+    said: list[str] = []
+    more = search._with_last_look(search.Settings(folder, 200, "easy"), found, said.append)
+    assert said[-1].startswith("looked again: ")
+    blunt, sharp = (load_cascade(str(folder / name)) for name in ("blunt.toml", "sharp.toml"))
+    assert blunt.relief is None
+    assert sharp.judge == blunt.judge
+    assert sharp.relief is not None
+    assert sharp.relief == more.relief
+    assert 0 < len(sharp.relief.spots) <= last_look.MOST_SPOTS
+    assert len(sharp.relief.trees) == last_look.TREES
+    asked = {name.rpartition(".")[0] for tree in sharp.relief.trees for name, _ in cuts(tree)}
+    assert asked == {spot.name for spot in sharp.relief.spots}
+
+
+def test_nothing_to_tell_apart_gives_no_last_look():
+    same = last_look.Looks(
+        np.zeros((9, 2 * len(last_look.SPOTS)), np.int16), np.ones(9, np.int8), np.zeros(9)
+    )
+    assert last_look.fit_relief(same, 0) is None
+    different = replace(same, label=np.arange(9, dtype=np.int8) % 2)
+    assert last_look.fit_relief(different, 0) is None  # of what is seen alike

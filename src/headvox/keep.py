@@ -10,7 +10,7 @@ import numpy.typing as npt
 from headvox.config import DetectorConfig
 from headvox.data import F64, Expected, Frame
 from headvox.masks.cascade import Cascade
-from headvox.masks.compile import SCORE_UNIT
+from headvox.masks.compile import SCORE_UNIT, CompiledRelief
 
 I64 = npt.NDArray[np.int64]
 
@@ -26,6 +26,11 @@ def least_score(config: DetectorConfig, cascade: Cascade, blind: bool) -> int:
     if least is None:
         least = cascade.min_score_occupied if blind else cascade.min_score
     return math.ceil(least * SCORE_UNIT)
+
+
+def least_before(least: int, relief: CompiledRelief | None, sees: bool) -> int:
+    """Return the least score of what the last look might make a head of; ``sees`` says whether there is one."""
+    return least - relief.most if relief is not None and sees else least
 
 
 def slack_of(config: DetectorConfig, expected: Expected | None) -> int:

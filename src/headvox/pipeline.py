@@ -20,7 +20,7 @@ from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners
-from headvox.keep import asks_cameras, keep, least_score, slack_of
+from headvox.keep import asks_cameras, keep, least_before, least_score, slack_of
 from headvox.machine.clock import Clock
 from headvox.machine.kernels import read_only
 from headvox.machine.threads import Threads, new_blocks
@@ -30,6 +30,7 @@ from headvox.memory import Memory, Stages
 from headvox.placing import Placing
 from headvox.pose.fit import fit_poses
 from headvox.refine import fit_spheres
+from headvox.relief import look_again
 from headvox.slabs import shares_of
 from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, best_of_each, local_maxima
 from headvox.visibility import count_states, look_about
@@ -308,7 +309,7 @@ class Detector:
         self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: Memory,
         expected: Expected | None,
     ) -> tuple[I32, I64, I64, int]:  # fmt: skip
-        """Look closer at the peaks, and let those through that reach the cascade's threshold.
+        """Look closer at the peaks, and let those through that reach the cascade's threshold, or still may.
 
         Returned are their cells, their scores, which of the peaks they were, and the threshold, in steps of the score.
         """
@@ -321,7 +322,8 @@ class Detector:
                 scores = self._look_about(frame, S, cells, judge, memory)
         least = least_score(self.config, self.cascade.source, blind=memory.sees and not sees)
         centres, slack = memory.centres(cells), slack_of(self.config, expected)
-        kept = keep(centres, scores, least, slack, expected, memory.lattice.voxel_m)
+        hopeful = least_before(least, self.cascade.relief, sees)
+        kept = keep(centres, scores, hopeful, slack, expected, memory.lattice.voxel_m)
         return cells[kept], scores[kept], peaks[kept], least
 
     def _best_about(
@@ -379,6 +381,9 @@ class Detector:
         yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks]]
         haired = knows_an_origin(frame)
         heads = heads_at(memory.centres(cells), scores, least, spheres, haired, yaws)
+        relief, slack = self.cascade.relief, slack_of(self.config, expected)
+        if relief is not None and asks_cameras(frame, memory.sees):
+            heads, _ = look_again(heads, frame.depths, relief, least, slack, expected, memory.lattice.voxel_m)
         if self.config.refine != "pose":
             return heads
         best = heads.centres[:MOST_POSES]

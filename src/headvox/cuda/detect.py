@@ -10,10 +10,11 @@ from headvox.config import DetectorConfig
 from headvox.cuda.device import Device
 from headvox.cuda.readings import Asked, Found
 from headvox.data import Expected, Frame, Heads
-from headvox.keep import asks_cameras, least_score, slack_of
+from headvox.keep import asks_cameras, least_before, least_score, slack_of
 from headvox.machine.clock import Clock
 from headvox.masks.compile import CompiledCascade
 from headvox.placing import Placing
+from headvox.relief import look_again
 from headvox.suppress import AROUND, MOST_PEAKS
 from headvox.voxelize import Lattice
 
@@ -56,8 +57,9 @@ class OnDevice:
         """Return what the device is to do with ``frame``."""
         sees = asks_cameras(frame, self._sees)
         least = least_score(self.config, self.cascade.source, blind=self._sees and not sees)
+        hopeful = least_before(least, self.cascade.relief, sees)
         lattice = self._placing.lattice(frame, self.cascade)
-        return Asked(frame, lattice, sees, least, slack_of(self.config, expected), expected)
+        return Asked(frame, lattice, sees, hopeful, slack_of(self.config, expected), expected)
 
     def _device_for(self, lattice: Lattice) -> Device:
         if self.device is None or self.device.shape != lattice.shape:
@@ -72,5 +74,11 @@ class OnDevice:
             raise nothing_in_range(asked.frame, asked.lattice.region)
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[found.yaws]
-        heads = stated(found.centres, found.radii, found.scores, asked.least, yaws)
-        return heads if found.poses is None else with_poses(heads, found.poses)
+        heads, poses = stated(found.centres, found.radii, found.scores, asked.least, yaws), found.poses
+        relief = self.cascade.relief
+        if relief is not None and asked.sees:
+            least = asked.least + relief.most
+            common = (asked.slack, asked.expected, asked.lattice.voxel_m)
+            heads, kept = look_again(heads, asked.frame.depths, relief, least, *common)
+            poses = None if poses is None else poses.of(kept, heads.centres)
+        return heads if poses is None else with_poses(heads, poses)

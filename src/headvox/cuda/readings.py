@@ -55,7 +55,7 @@ I64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A frame, where it is searched, whether the cameras are asked, and what a head is: see :mod:`headvox.keep`."""
+    """A frame, where it is searched, whether the cameras are asked, and what may be a head: see :mod:`headvox.keep`."""
 
     frame: Frame
     lattice: Lattice

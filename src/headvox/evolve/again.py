@@ -93,7 +93,7 @@ def peaks_of(view: View, cascade: Path) -> Peaks | None:
         return None
     grid = Grid.of(view.frame)
     cells, scores = detector.told
-    label, bag = _label(view, grid.lattice.centres(cells))
+    label, bag = label_places(view, grid.lattice.centres(cells))
     known = label >= 0
     if not known.any():
         return None
@@ -105,7 +105,7 @@ def peaks_of(view: View, cascade: Path) -> Peaks | None:
     return Peaks(asked, scores[known])
 
 
-def _label(view: View, centres: F64) -> tuple[npt.NDArray[np.int8], I64]:
+def label_places(view: View, centres: F64) -> tuple[npt.NDArray[np.int8], I64]:
     """Return 1 (a head), 0 (none) or -1 (neither) for each place, and which head it is near."""
     heads = view.heads
     cut = (heads.visible >= LEAST_VISIBLE) & (heads.posture < len(POSTURES)) & ~heads.clear

@@ -134,31 +134,41 @@ def fit(
     ``start`` is the score before, ``share`` that of the ``columns`` that each tree may use, ``other`` what goes before
     LightGBM's settings here.
     """
+    learn = rows & ~samples.aside
+    model = train(
+        columns_of(samples, learn, columns), samples.label[learn], None if start is None else start[learn],
+        np.where(samples.label[learn] == 1, head_weight, 1.0), trees, rate, share, seed, other,
+    )  # fmt: skip
+    score = np.full(len(rows), -1e3)
+    score[rows] = model.predict(columns_of(samples, rows, columns), raw_score=True, num_threads=2)
+    if start is not None:
+        score[rows] += start[rows]
+    return model, score
+
+
+def train(
+    features: npt.NDArray[np.float32], label: npt.NDArray[np.int8], start: F64 | None, weight: F64 | None, trees: int,
+    rate: float, share: float, seed: int, other: dict[str, int] | None = None,
+) -> Any:  # fmt: skip
+    """Return LightGBM's model of rows of ``features`` (N, F): see :func:`fit`.
+
+    Raises:
+        HeadvoxError: the library is missing.
+    """
     try:
         import lightgbm
     except ImportError:
         raise HeadvoxError(
             "The search for a cascade needs LightGBM.", "pip install 'headvox[evolve]'"
         ) from None
-    learn = rows & ~samples.aside
-    data = lightgbm.Dataset(
-        columns_of(samples, learn, columns),
-        samples.label[learn],
-        init_score=None if start is None else start[learn],
-        weight=np.where(samples.label[learn] == 1, head_weight, 1.0),
-    )
+    data = lightgbm.Dataset(features, label, init_score=start, weight=weight)
     settings = {
         "objective": "binary", "num_leaves": 8, "max_depth": 4, "learning_rate": rate, "min_data_in_leaf": 40,
         "feature_fraction": share, "bagging_fraction": 0.8, "bagging_freq": 1, "lambda_l2": 3.0, "seed": seed + 1,
         "deterministic": True, "force_row_wise": True, "num_threads": 2, "verbose": -1,
         **(other or {}),
     }  # fmt: skip
-    model = lightgbm.train(settings, data, trees)
-    score = np.full(len(rows), -1e3)
-    score[rows] = model.predict(columns_of(samples, rows, columns), raw_score=True, num_threads=2)
-    if start is not None:
-        score[rows] += start[rows]
-    return model, score
+    return lightgbm.train(settings, data, trees)
 
 
 def quantile_of_heads(samples: Samples, score: F64, rows: Mask, share: float) -> float:

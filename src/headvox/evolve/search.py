@@ -21,6 +21,7 @@ from headvox.evolve import boost, gates
 from headvox.evolve.again import Peaks, fit_again, spoilt_peaks
 from headvox.evolve.bank import SUBDIVISION, VOXEL_M
 from headvox.evolve.check import check
+from headvox.evolve.relief import Looks, fit_relief, spoilt_looks
 from headvox.evolve.samples import (
     GateSums,
     Samples,
@@ -105,7 +106,7 @@ def evolve(settings: Settings, say: Say) -> Found:
             break
         best, best_recall = found, recall
     assert best is not None
-    return _with_second_opinion(settings, best, say)
+    return _with_last_look(settings, _with_second_opinion(settings, best, say), say)
 
 
 def _with_second_opinion(settings: Settings, found: Found, say: Say) -> Found:
@@ -127,6 +128,22 @@ def _with_second_opinion(settings: Settings, found: Found, say: Say) -> Found:
     write_cascade(path, settings.name, found)
     found, recall = _with_thresholds(settings, path, found)
     say(f"asked again: {100 * recall:.1f} % of the heads kept aside at {FALSE_A_FRAME:g} false a frame")
+    return found
+
+
+def _with_last_look(settings: Settings, found: Found, say: Say) -> Found:
+    """Return ``found`` with the relief's trees, and its thresholds set anew."""
+    path = settings.work / "blunt.toml"
+    write_cascade(path, settings.name, found)
+    parts = [part for part in _of_views(settings, partial(spoilt_looks, cascade=path)) if part is not None]
+    relief = fit_relief(Looks.join(parts), settings.seed) if parts else None
+    if relief is None:
+        return found
+    found = replace(found, relief=relief)
+    path = settings.work / "sharp.toml"
+    write_cascade(path, settings.name, found)
+    found, recall = _with_thresholds(settings, path, found)
+    say(f"looked again: {100 * recall:.1f} % of the heads kept aside at {FALSE_A_FRAME:g} false a frame")
     return found
 
 

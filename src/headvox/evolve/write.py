@@ -12,7 +12,7 @@ from typing import Any
 from headvox.atomic import write_text
 from headvox.evolve.bank import OCCUPIED, SEEN, SUBDIVISION, VOXEL_M
 from headvox.evolve.boost import Fitted
-from headvox.masks.cascade import Condition, Group
+from headvox.masks.cascade import Condition, Group, Relief
 
 WHY = {
     "crown": "the upper half is there", "beside": "about the crown there is less than in it",
@@ -33,6 +33,7 @@ class Found:
     min_score: float = 0.0
     min_score_occupied: float = 0.0
     tuned_on: tuple[str, ...] = ()
+    relief: Relief | None = None
 
 
 def write_cascade(path: Path, name: str, found: Found) -> None:
@@ -87,7 +88,16 @@ def cascade_text(name: str, found: Found) -> str:
         at = ['at = "peaks"'] if stage in found.judge else []
         lines += ["[[stage]]", f'name = "{stage.plan.name}"', *at, *keep, "trees = ["]
         lines += [*(f"  {tree}," for tree in its_trees), "]", ""]
-    return "\n".join(lines)
+    return "\n".join(lines + relief_lines(found.relief))
+
+
+def relief_lines(relief: Relief | None) -> list[str]:
+    """Return the last look as lines of TOML."""
+    if relief is None:
+        return []
+    spots = [f"{spot.name} = [{spot.side:g}, {spot.up:g}]" for spot in relief.spots]
+    trees = [f"  {json.dumps(tree)}," for tree in relief.trees]
+    return ["[relief]", f"most = {relief.most:g}", "trees = [", *trees, "]", "", "[relief.spots]", *spots, ""]
 
 
 def _numbers(values: Sequence[float]) -> str:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 CHANNELS = ("occupied", "empty", "hidden")
 # smallest, 3rd smallest, 3rd largest, largest, all together
 STATISTICS = ("min", "low", "high", "max", "sum")
+SIDES = ("near", "far")  # of a spot: that where the surface is nearer to the camera, and the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,27 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True)
+class Spot:
+    """A pair of places beside and above the candidate, as its camera sees it: ``side`` m to either side, ``up`` m."""
+
+    name: str
+    side: float
+    up: float
+
+
+@dataclass(frozen=True, slots=True)
+class Relief:
+    """The last look at what may be a head, pixel by pixel: trees change the score, by ``most`` at most.
+
+    A cut is in metres: how much farther than the candidate the surface is at a spot, on its nearer or farther side.
+    """
+
+    most: float
+    spots: tuple[Spot, ...]
+    trees: tuple[Tree, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Cascade:
     """A cascade as its file has it. Exactly one of ``votes`` and ``stages`` is there."""
 
@@ -102,6 +124,8 @@ class Cascade:
     """1: every voxel is a candidate; 2: every other, as the black squares of a chess board are; 4: every fourth."""
     judge: tuple[Stage, ...] = ()
     """Stages that score the voxels about the peaks of ``stages`` anew."""
+    relief: Relief | None = None
+    """What has the last word, where depth images were seen."""
 
     @property
     def every_stage(self) -> tuple[Stage, ...]:

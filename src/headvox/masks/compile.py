@@ -6,6 +6,7 @@ Compiled, everything is integer: boxes are offsets, cuts are sums, leaf weights 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,12 @@ import numpy.typing as npt
 from headvox.errors import HeadvoxError
 from headvox.masks.cascade import (
     CHANNELS,
+    SIDES,
     STATISTICS,
     Box,
     Cascade,
     Group,
+    Relief,
     Stage,
     Tree,
     Votes,
@@ -108,6 +111,22 @@ class CompiledStages:
 
 
 @dataclass(frozen=True, slots=True)
+class CompiledRelief:
+    """The last look in millimetres. Feature 2 k is the near, 2 k + 1 the far side of spot k.
+
+    ``nodes``, ``root`` and ``depth`` are as those of :class:`CompiledStages`.
+    """
+
+    spots: npt.NDArray[np.float64]
+    """(K, 2) metres to the side and up"""
+    nodes: I64
+    root: I64
+    depth: I32
+    most: int
+    """The score changes by no more than that, in steps."""
+
+
+@dataclass(frozen=True, slots=True)
 class CompiledCascade:
     """A cascade for one voxel size, all integer."""
 
@@ -119,6 +138,7 @@ class CompiledCascade:
     judge: CompiledStages | None
     largest_sum: int
     """Volume in voxel parts of the largest thing that is summed: tells which integer type an integral volume needs."""
+    relief: CompiledRelief | None = None
 
 
 def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledCascade:
@@ -148,7 +168,8 @@ def compile_cascade(cascade: Cascade, voxel_m: float | None = None) -> CompiledC
             f"Cascade {cascade.name}: in voxels of {voxel:g} m a condition of its gate outgrows 32 bits.",
             "Make its boxes smaller or fewer, or their weights less.",
         )
-    return CompiledCascade(cascade, voxel, gate, votes, stages, judge, largest)
+    relief = _compile_relief(cascade.relief) if cascade.relief else None
+    return CompiledCascade(cascade, voxel, gate, votes, stages, judge, largest, relief)
 
 
 def _box_table(boxes: list[list[int]]) -> I32:
@@ -240,25 +261,16 @@ def _compile_stages(cascade: Cascade, stages: tuple[Stage, ...], voxel: float, u
             "Make them smaller or fewer, or the voxels larger.",
         )
 
-    nodes: list[int] = []
-
-    def add(tree: Tree) -> tuple[int, int]:
-        """Add a tree; return where its first node begins, and how deep it is."""
-        at = len(nodes)
-        if not isinstance(tree, tuple):
-            nodes.extend([0, round(tree * SCORE_UNIT), at, at])
-            return at, 0
-        name, share, below, above = tree
+    def asked(name: str, share: float) -> tuple[int, int]:
         group, _, statistic = name.rpartition(".")
         feature = len(STATISTICS) * index[group] + STATISTICS.index(statistic)
-        nodes.extend([feature, _floor(round(share * sizes[name], 6)), 0, 0])
-        (nodes[at + 2], left), (nodes[at + 3], right) = add(below), add(above)
-        return at, 1 + max(left, right)
+        return feature, _floor(round(share * sizes[name], 6))
 
+    nodes: list[int] = []
     roots: list[tuple[int, int]] = []
     stage_trees = [0]
     for stage in stages:
-        roots += [add(tree) for tree in stage.trees]
+        roots += [_add_tree(tree, asked, nodes) for tree in stage.trees]
         stage_trees.append(len(roots))
     channel = [CHANNELS.index(group.channel) for group, _ in groups]
     first = [stage for _, stage in groups]
@@ -275,6 +287,44 @@ def _compile_stages(cascade: Cascade, stages: tuple[Stage, ...], voxel: float, u
         np.array(stage_trees, dtype=np.int32),
         np.array([-_floor(-stage.keep * SCORE_UNIT) for stage in stages], dtype=np.int64),
         min(seeing, default=count),
+    )
+
+
+def _add_tree(
+    tree: Tree, asked: Callable[[str, float], tuple[int, int]], nodes: list[int]
+) -> tuple[int, int]:
+    """Add a tree to ``nodes``; return where its first node begins, and how deep it is.
+
+    ``asked`` turns the name and the cut of a node into a feature and a whole number.
+    """
+    at = len(nodes)
+    if not isinstance(tree, tuple):
+        nodes.extend([0, round(tree * SCORE_UNIT), at, at])
+        return at, 0
+    name, cut, below, above = tree
+    nodes.extend([*asked(name, cut), 0, 0])
+    (nodes[at + 2], left), (nodes[at + 3], right) = (
+        _add_tree(below, asked, nodes),
+        _add_tree(above, asked, nodes),
+    )
+    return at, 1 + max(left, right)
+
+
+def _compile_relief(relief: Relief) -> CompiledRelief:
+    index = {spot.name: k for k, spot in enumerate(relief.spots)}
+
+    def asked(name: str, metres: float) -> tuple[int, int]:
+        spot, _, side = name.rpartition(".")
+        return len(SIDES) * index[spot] + SIDES.index(side), _floor(round(1000.0 * metres, 6))
+
+    nodes: list[int] = []
+    roots = [_add_tree(tree, asked, nodes) for tree in relief.trees]
+    return CompiledRelief(
+        np.array([(spot.side, spot.up) for spot in relief.spots]),
+        np.array(nodes, dtype=np.int64),
+        np.array([root for root, _ in roots], dtype=np.int64),
+        np.array([depth for _, depth in roots], dtype=np.int32),
+        math.floor(relief.most * SCORE_UNIT),
     )
 
 

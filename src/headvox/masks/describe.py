@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from headvox.commands.table import printable, table
-from headvox.masks.cascade import Cascade, Condition, Group, Stage, Votes, cuts
+from headvox.masks.cascade import Cascade, Condition, Group, Relief, Stage, Votes, cuts
 from headvox.masks.compile import volume, voxel_box
 
 LOOK_UPS_A_BOX = 8
@@ -20,6 +20,8 @@ def describe_cascade(cascade: Cascade) -> str:
         parts.append(_votes(cascade.votes))
     else:
         parts += [_groups(cascade), _stages(cascade)]
+    if cascade.relief is not None:
+        parts.append(_relief(cascade.relief))
     return "\n\n".join(parts)
 
 
@@ -162,6 +164,21 @@ def _stages(cascade: Cascade) -> str:
     trees = sum(len(stage.trees) for stage in cascade.every_stage)
     heading = f"Stage 2, boosted: {trees} trees in {len(rows)} stages"
     return f"{heading}\n{table(columns, rows)}"
+
+
+def _relief(relief: Relief) -> str:
+    asked = {name.rpartition(".")[0]: 0 for tree in relief.trees for name, _ in cuts(tree)}
+    for tree in relief.trees:
+        for name, _ in cuts(tree):
+            asked[name.rpartition(".")[0]] += 1
+    rows = [
+        [spot.name, f"{spot.side:g}", f"{spot.up:+g}", str(asked.get(spot.name, 0))] for spot in relief.spots
+    ]
+    heading = (
+        f"The last look, in depth images: {len(relief.trees)} trees over {len(rows)} pairs of spots, which change the "
+        f"score by {relief.most:g} at most"
+    )
+    return f"{heading}\n{table(['spot', 'to either side (m)', 'up (m)', 'cuts'], rows)}"
 
 
 def _at(cascade: Cascade, stage: Stage) -> str:

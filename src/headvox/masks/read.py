@@ -12,11 +12,14 @@ from typing import Any
 from headvox.errors import HeadvoxError
 from headvox.masks.cascade import (
     CHANNELS,
+    SIDES,
     Box,
     Cascade,
     Condition,
     Group,
     Mask,
+    Relief,
+    Spot,
     Stage,
     Tree,
     Votes,
@@ -34,6 +37,7 @@ FORMAT = "headvox-cascade"
 SPACINGS = {"all": 1, "every other": 2, "every fourth": 4}
 MAX_FILE_BYTES = 8 << 20
 MAX_EXTENT_M = 2.0
+MOST_SPOTS = 256
 LARGEST = 1e9  # of shares and scores: their sums stay far within 64 bits
 
 
@@ -219,7 +223,7 @@ class _Reader:
             raise self.error(where, "[feature, cut, at most, above], 30 deep at most", value)
         feature = self.text(value[0], where)
         if feature not in features:
-            raise self.error(where, "a statistic of a group of this file, as ring.max", feature)
+            raise self.error(where, "a statistic of a group or a side of a spot of this file", feature)
         cut = self.number(value[1], where)
         return (
             feature,
@@ -243,9 +247,35 @@ class _Reader:
         )
         return stage, at
 
+    def relief(self, value: object) -> Relief:
+        table = self.table(value, "relief", {"most", "spots", "trees"})
+        spots = []
+        named = table.get("spots")
+        for name, place in named.items() if isinstance(named, dict) else ():
+            where = f"relief.spots.{name}"
+            if len(self.items(place, where)) != 2:
+                raise self.error(where, "two numbers: to the side, and up", place)
+            side, up = (self.number(v, where, -MAX_EXTENT_M, MAX_EXTENT_M) for v in place)
+            spots.append(Spot(name, side, up))
+        if not 1 <= len(spots) <= MOST_SPOTS:
+            raise self.error("relief.spots", f"a table of 1 to {MOST_SPOTS} spots", named)
+        features = {f"{spot.name}.{side}" for spot in spots for side in SIDES}
+        trees = self.items(table.get("trees"), "relief.trees")
+        most = self.number(table.get("most"), "relief.most", 0.0, 1000.0)
+        return Relief(most, tuple(spots), tuple(self.tree(tree, features, "relief.trees") for tree in trees))
+
     def cascade(self, value: dict[str, Any]) -> Cascade:
         known = {"format", "version", "name", "summary", "voxel_m", "subdivision", "occupancy", "gate"}
-        known |= {"votes", "group", "stage", "min_score", "min_score_occupied", "tuned_on", "candidates"}
+        known |= {
+            "votes",
+            "group",
+            "stage",
+            "min_score",
+            "min_score_occupied",
+            "tuned_on",
+            "candidates",
+            "relief",
+        }
         table = self.table(value, "the file", known)
         if table.get("format") != FORMAT or table.get("version") != 1:
             raise self.error("format, version", f'"{FORMAT}", 1', (table.get("format"), table.get("version")))
@@ -307,4 +337,5 @@ class _Reader:
             ),
             spacing=SPACINGS[candidates],
             judge=judge,
+            relief=self.relief(table["relief"]) if "relief" in table else None,
         )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from headvox.data import F64, Expected, Frame
+from headvox.data import F64, I64, Expected, Frame
 from headvox.machine.threads import Threads
 from headvox.pose.nearby import gather, sensors_of
 from headvox.pose.settle import expect_turns, finish_all
@@ -50,6 +50,13 @@ class Poses(NamedTuple):
             return np.full((len(centres), *shape), np.nan)
 
         return cls(centres.copy(), nan(4), nan(), nan(3, 3), nan(3, 3), nan(), nan(), nan())
+
+    def of(self, rows: I64, centres: F64) -> Poses:
+        """Return those of some ``rows`` (N,), unknown where there is no such row; ``centres`` (N, 3) are theirs."""
+        told, there = Poses.unknown(centres), rows < len(self.radii)
+        for mine, theirs in zip(told, self, strict=True):
+            mine[there] = theirs[rows[there]]
+        return told
 
 
 @lru_cache(maxsize=1)

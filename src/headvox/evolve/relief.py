@@ -1,0 +1,125 @@
+"""The trees of the last look: fitted to the peaks that the detector leaves in spoilt views, as the judge's last stage.
+
+What is asked is new to the cascade, at the full resolution of the images, so a few leaves a tree are no luxury here;
+how far all of them together may change a score is limited instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from headvox.config import DetectorConfig
+from headvox.data import F64
+from headvox.errors import HeadvoxError
+from headvox.evolve import samples
+from headvox.evolve.again import label_places
+from headvox.evolve.boost import train
+from headvox.evolve.spoil import spoil
+from headvox.evolve.views import View
+from headvox.masks.cascade import SIDES, Relief, Spot, Tree
+from headvox.pipeline import Detector
+from headvox.relief import relief_about
+
+LEAST_SCORE = -5.0  # of the peaks that are looked at
+MOST_SPOTS = 48  # chosen by what a short boosting over all gains from them
+CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE = 100, 0.15, 0.2
+TREES, RATE, SHARE_OF_FEATURES = 150, 0.1, 0.35
+LEAVES, LEAST_ROWS = 4, 80
+MOST = 2.0  # how far the score may change
+
+FINE_CM = [(side, up) for side in range(0, 16, 3) for up in range(-15, 16, 3)]
+COARSE_CM = [(side, up) for side in range(0, 37, 6) for up in range(-60, 31, 6)]
+SPOTS = tuple(
+    Spot(f"s{side:02d}{'u' if up >= 0 else 'd'}{abs(up):02d}", side / 100, up / 100)
+    for side, up in dict.fromkeys(FINE_CM + COARSE_CM)
+)
+PLACES: F64 = np.array([(spot.side, spot.up) for spot in SPOTS])
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What was seen about some peaks: ``relief`` (N, 2 SPOTS) mm, whether it is a head, and the score before."""
+
+    relief: npt.NDArray[np.int16]
+    label: npt.NDArray[np.int8]
+    score: F64
+
+    @classmethod
+    def join(cls, parts: Sequence[Looks]) -> Looks:
+        """Put those of several views one after the other."""
+        columns = zip(*((part.relief, part.label, part.score) for part in parts), strict=True)
+        return cls(*map(np.concatenate, columns))
+
+
+@lru_cache(maxsize=1)
+def _detector(cascade: Path, written_ns: int) -> Detector:
+    settings = DetectorConfig(
+        cascade=str(cascade), max_range_m=samples.RANGE_M, min_score=LEAST_SCORE, refine="sphere"
+    )
+    return Detector(settings, backend="cpu")
+
+
+def spoilt_looks(view: View, cascade: Path) -> Looks | None:
+    """Return what is seen about the peaks of ``view``, spoilt, or None: there are none, or it is kept aside."""
+    if not view.frame.depths or view.frame.clouds or samples.is_aside(np.array([view.number]))[0]:
+        return None
+    return looks_at(spoil(view, np.random.default_rng([view.number, 7])), cascade)
+
+
+def looks_at(view: View, cascade: Path) -> Looks | None:
+    """Return what is seen about the peaks that are certainly a head or none."""
+    detector = _detector(cascade, cascade.stat().st_mtime_ns)
+    try:
+        heads = detector.detect_frame(view.frame)
+    except HeadvoxError:  # nothing in range
+        return None
+    label, _ = label_places(view, heads.centres)
+    known = np.flatnonzero(label >= 0)
+    if not len(known):
+        return None
+    relief, _ = relief_about(view.frame.depths, heads.centres[known], PLACES)
+    return Looks(relief, label[known], heads.scores[known])
+
+
+def fit_relief(looks: Looks, seed: int) -> Relief | None:
+    """Return the trees that were fitted to ``looks``, or None: there is nothing to tell apart."""
+    if len(np.unique(looks.label)) < 2:
+        return None
+
+    def fit(columns: npt.NDArray[np.int64], trees: int, rate: float, share: float) -> Any:
+        settings = {"num_leaves": LEAVES, "min_data_in_leaf": LEAST_ROWS}
+        features = looks.relief[:, columns].astype(np.float32)
+        return train(features, looks.label, looks.score, None, trees, rate, share, seed, settings)
+
+    every = np.arange(looks.relief.shape[1])
+    gain = fit(every, CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE).feature_importance("gain")
+    of_spot = gain.reshape(-1, len(SIDES)).sum(axis=1)
+    chosen = np.sort(np.argsort(-of_spot, kind="stable")[:MOST_SPOTS])
+    columns = every[np.isin(every // len(SIDES), chosen)]
+    model = fit(columns, TREES, RATE, SHARE_OF_FEATURES)
+    trees = tuple(_tree(info["tree_structure"], columns) for info in model.dump_model()["tree_info"])
+    used = {name for tree in trees for name in _names(tree)}
+    return Relief(MOST, tuple(spot for spot in SPOTS if spot.name in used), trees) if used else None
+
+
+def _tree(node: dict[str, Any], columns: npt.NDArray[np.int64]) -> Tree:
+    if "leaf_value" in node:
+        return round(float(node["leaf_value"]), 3) + 0.0
+    spot, side = divmod(int(columns[node["split_feature"]]), len(SIDES))
+    metres = (math.floor(node["threshold"]) + 0.5) / 1000.0
+    below, above = (_tree(node[child], columns) for child in ("left_child", "right_child"))
+    return f"{SPOTS[spot].name}.{SIDES[side]}", metres, below, above
+
+
+def _names(tree: Tree) -> set[str]:
+    if not isinstance(tree, tuple):
+        return set()
+    return {tree[0].rpartition(".")[0]} | _names(tree[2]) | _names(tree[3])

@@ -154,7 +154,9 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=40, help="of each kind")
     parser.add_argument("--turns", type=int, default=1, help="of each of 44 shells; 0 leaves them out")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--seed", type=int, default=EVALUATION, help="of the people and the rooms")
+    parser.add_argument(
+        "--seed", type=lambda text: int(text, 0), default=EVALUATION, help="of the people and the rooms"
+    )
     args = parser.parse_args()
     jobs = [(args.seed, kind, number) for number in range(args.views) for kind in KINDS]
     results = [r for r in Workers(args.workers).map(one_view, jobs) if r is not None]

@@ -156,6 +156,12 @@ def polish_one(samples, rays, state, upright, template):
     return state, told, np.linalg.inv(A)[:6, :6]
 
 
+def recentre(centre, state, template):
+    """Where the centre of a head of this shape is that is seen all around."""
+    shift = template.centre_of_shape @ [1, *state[12:]]
+    return centre + np.exp(state[12]) * state[3:12].reshape(3, 3) @ shift
+
+
 def settle(work, count, best, centre, template):
     """What is stated of a mixture of states: centre, radius, its covariance, quaternion and its covariance."""
     states, evidence = work.states[:count], work.told[:count, align.EVIDENCE]

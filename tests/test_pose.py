@@ -188,6 +188,18 @@ def test_settling_equals_the_naive_twin(seed):
     assert np.isnan(poses.radii[0])
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_centre_of_a_shape_equals_the_naive_twin(seed):
+    rng = np.random.default_rng(seed)
+    template = TEMPLATE._replace(centre_of_shape=rng.normal(0, 0.003, TEMPLATE.centre_of_shape.shape))
+    state, start, poses = random_state(rng), rng.normal(size=3), Poses.unknown(np.zeros((2, 3)))
+    poses.centres[1] = start
+    settle.recentre(state, template, poses, 1)
+    np.testing.assert_allclose(poses.centres[1], naive_pose.recentre(start, state, template), rtol=1e-9)
+    assert np.linalg.norm(poses.centres[1] - start) > 1e-4
+    assert not poses.centres[0].any()
+
+
 def test_turns_between_states_equal_scipys():
     rng = np.random.default_rng(0)
     turns = [np.zeros(3), 1e-12 * np.ones(3), *rng.normal(0, 2, (40, 3)), *((np.pi - 1e-7) * np.eye(3))]

@@ -8,6 +8,7 @@ above zero where it is free. Every person counts twice, once mirrored. What is k
 - the mean signed distance;
 - its principal modes near the surface, hair and clothes weighing less than a face; the rest by regression;
 - the standard deviation of what the modes leave unexplained: small on a face, large on hair and shoulders;
+- where the centre of a head of some shape is, from fits of shells and of people who are seen all around;
 - how much surer a fit believes itself to be than it is, from fits of other simulated people in rooms.
 
 Identities are drawn from seeds of their own (``TRAINING``), which nothing that measures accuracy uses.
@@ -18,6 +19,7 @@ Identities are drawn from seeds of their own (``TRAINING``), which nothing that 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -26,18 +28,20 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from headvox.data import Intrinsics
+from headvox.data import Cloud, Frame, Intrinsics
 from headvox.frames import inverse, transform
 from headvox.machine.kernels import kernel
 from headvox.machine.threads import Threads
 from headvox.parallel.workers import Workers
-from headvox.pose.align import EVIDENCE
+from headvox.pose.align import EVIDENCE, SCALE_SIGMA
 from headvox.pose.fit import FitMemory, fit_poses
-from headvox.pose.trials import TRIED
-from headvox.synth.people import PosedBody, pose_person, sample_person, sample_pose
+from headvox.pose.trials import STANDS, TRIED
+from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
+from headvox.synth.people import Person, PosedBody, pose_person, sample_person, sample_pose
 from headvox.synth.people import _rest as rest
 from headvox.synth.portraits import portrait
 from headvox.synth.rays import Mesh, look
+from headvox.synth.spread import spread_points
 
 TRAINING = 0x7E3A1
 POSTURES = ("standing", "walking", "sitting", "bending", "crouching", "lying")
@@ -52,6 +56,8 @@ LENS = Intrinsics(200, 200, 375.0, 375.0, 99.5, 99.5)
 FARTHEST_M = 0.08  # distances are cut off here
 BAND_M = 0.025  # how far from the surface a mode matters
 MEAN_UNIT_M, SIGMA_UNIT_M = 5e-5, 2e-4
+SHELLS, SHELL_POINTS = 360, 9000  # heads that are seen all around
+RIDGE = 10.0
 FLOOR_M = 0.0025  # of a sigma: what the template's voxels cost
 
 
@@ -81,18 +87,11 @@ def camera_poses() -> np.ndarray:
 
 def signed_distance(body: PosedBody, scale: float) -> np.ndarray:
     """Return the signed distance (N,) of the voxels to the visible surface, of the head scaled to the mean size."""
-    vertices = transform(inverse(body.T_world_head), body.vertices) / scale
-    ones = np.ones(len(body.faces), np.float32)
-    mesh = Mesh(vertices, body.faces, ones, np.zeros(len(ones), np.int32))
     voxels = voxel_centres()
     seen = np.zeros(len(voxels), np.int64)
     surface = []
-    for T_head_camera in camera_poses():
-        distance = look(mesh, LENS, T_head_camera).distance_m
-        v, u = np.nonzero(distance < AWAY_M + 0.5)
-        z = distance[v, u].astype(np.float64)
-        rays = np.column_stack([(u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones(len(u))])
-        surface.append(transform(T_head_camera, rays * z[:, None]))
+    for T_head_camera, distance, points in look_around(body, scale):
+        surface.append(points)
         count_sights(voxels, inverse(T_head_camera), LENS.fx, LENS.cx, distance, seen)
     points = np.concatenate(surface)
     points = points[(np.abs(points) < 0.4).all(1)]
@@ -100,6 +99,19 @@ def signed_distance(body: PosedBody, scale: float) -> np.ndarray:
     tree = cKDTree(points[np.unique(key, return_index=True)[1]])
     distance = np.minimum(tree.query(voxels, distance_upper_bound=FARTHEST_M)[0], FARTHEST_M)
     return np.where(seen > 1, distance, -distance).astype(np.float16)
+
+
+def look_around(body: PosedBody, scale: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield T_head_camera, the depth image and its points (N, 3), head frame, of cameras around a scaled head."""
+    vertices = transform(inverse(body.T_world_head), body.vertices) / scale
+    ones = np.ones(len(body.faces), np.float32)
+    mesh = Mesh(vertices, body.faces, ones, np.zeros(len(ones), np.int32))
+    for T_head_camera in camera_poses():
+        distance = look(mesh, LENS, T_head_camera).distance_m
+        v, u = np.nonzero(distance < AWAY_M + 0.5)
+        z = distance[v, u].astype(np.float64)
+        rays = np.column_stack([(u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones(len(u))])
+        yield T_head_camera, distance, transform(T_head_camera, rays * z[:, None])
 
 
 @kernel
@@ -115,14 +127,19 @@ def count_sights(voxels, T_camera_head, f, c, distance, seen):
             seen[i] += 1
 
 
-def head_of(number: int, size_m: float) -> tuple[np.ndarray, float]:
-    """Return the signed distance of the training person ``number`` and their log scale."""
+def training_person(number: int) -> tuple[Person, PosedBody]:
+    """Return the training person ``number``, and their body in some posture."""
     rng = np.random.default_rng([TRAINING, number])
     person = sample_person(rng)
-    pose = sample_pose(rng, str(rng.choice(POSTURES, p=POSTURE_SHARES)))
+    return person, pose_person(person, sample_pose(rng, str(rng.choice(POSTURES, p=POSTURE_SHARES))))
+
+
+def head_of(number: int, size_m: float) -> tuple[np.ndarray, float]:
+    """Return the signed distance of the training person ``number`` and their log scale."""
+    person, body = training_person(number)
     size = rest(person)[0].head_size
     scale = float(np.exp(np.log(size).mean()) / size_m)
-    return signed_distance(pose_person(person, pose), scale), float(np.log(scale))
+    return signed_distance(body, scale), float(np.log(scale))
 
 
 def mean_size_m(people: int) -> float:
@@ -170,6 +187,46 @@ def quantised(learnt: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         "low_m": LOW,
         "voxel_m": np.array(VOXEL_M),
     }
+
+
+def all_around(number: int) -> np.ndarray:
+    """Return a cloud (N, 3), head frame, of a head that is seen all around: of two in three a bald shell."""
+    rng = np.random.default_rng([TRAINING, 3, number])
+    if number % 3 < 2:
+        shell = make_shell(sample_identities(SHELLS, TRAINING)[number], metric=False)
+        return spread_points(shell.vertices, shell.faces, SHELL_POINTS, rng) @ HEADVOX_TO_PAPER
+    points = np.concatenate([points for _, _, points in look_around(training_person(number)[1], 1.0)])
+    return rng.permutation(points[np.linalg.norm(points, axis=1) < 0.3])[:SHELL_POINTS]
+
+
+def shape_and_shift(number: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Fit the head ``number`` that is seen all around, and return 1, log scale and modes (2 + MODES,), and where its
+    centre is from the fitted one (3,), at the size of the mean head; None where the fit is wrong."""
+    rng = np.random.default_rng([TRAINING, 4, number])
+    turn, off = Rotation.from_quat(rng.normal(size=4)), rng.normal(0.0, 0.02, 3)
+    cloud = np.ascontiguousarray(turn.apply(all_around(number)), dtype=np.float32)
+    memory = FitMemory.new(1, 1)
+    fit_poses(Frame(0, clouds=(Cloud("head", cloud),)), off[None], memory, Threads(1))
+    trials = memory.trials
+    state = trials.states[0, np.argmin(trials.told[0, : trials.counts[0, TRIED], EVIDENCE])]
+    R = state[3:12].reshape(3, 3)
+    wrong = (turn.inv() * Rotation.from_matrix(R)).magnitude()
+    if trials.counts[0, STANDS] or wrong > np.radians(20.0):
+        return None
+    return np.array([1.0, *state[12:]]), -(R.T @ (off + state[:3])) / np.exp(state[12])
+
+
+def centre_of_shape(fits: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return the linear function (3, 2 + MODES) of what :func:`shape_and_shift` returns, by ridge regression."""
+    X, Y = (np.array(part) for part in zip(*fits, strict=True))
+    penalty = RIDGE * np.eye(X.shape[1])
+    penalty[0, 0] = 0.0
+    penalty[1, 1] *= SCALE_SIGMA**2  # of the log scale, as of the modes: by its own spread
+    B = np.linalg.solve(X.T @ X + penalty, X.T @ Y)
+    for name, off in (("before", Y), ("after", Y - X @ B)):
+        far = 1e3 * np.linalg.norm(off, axis=1)
+        print(f"centre seen all around, {name}: {np.median(far):.1f} / {np.percentile(far, 90):.1f} mm")
+    return np.asarray(B.T)
 
 
 def odds_and_errors(number: int) -> tuple[np.ndarray, ...] | None:
@@ -238,8 +295,12 @@ def main() -> None:
         made = list(Workers(args.workers).map(partial(head_of, size_m=size_m), range(args.people)))
         print(f"mean size {size_m:.4f} m, log scale sigma {np.std([scale for _, scale in made]):.3f}")
         asset = quantised(learn(np.array([distance for distance, _ in made]), args.modes))
-        asset |= {"size_m": np.array(size_m), "calibration": np.ones(3)}
+        untaught = {"calibration": np.ones(3), "centre_of_shape": np.zeros((3, 2 + args.modes))}
+        asset |= {"size_m": np.array(size_m)} | untaught
         np.savez_compressed(args.out, **asset)
+    known = Workers(args.workers).map(shape_and_shift, range(SHELLS))
+    asset["centre_of_shape"] = centre_of_shape([fit for fit in known if fit is not None])
+    np.savez_compressed(args.out, **asset)
     fits = list(Workers(args.workers).map(odds_and_errors, range(args.views)))
     asset["calibration"] = calibration([fit for fit in fits if fit is not None])
     print("temperature, shift factor, turn factor:", asset["calibration"].round(2).tolist())

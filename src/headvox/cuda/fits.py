@@ -72,8 +72,9 @@ class Fits:
         self.upright, self.anyhow = cuda.to_device(upright_turns()), cuda.to_device(all_turns())
         template = load_template()
         self.template = template._replace(
-            rows=cuda.to_device(template.rows), low=cuda.to_device(template.low)
-        )
+            rows=cuda.to_device(template.rows), low=cuda.to_device(template.low),
+            centre_of_shape=cuda.to_device(template.centre_of_shape),
+        )  # fmt: skip
 
     def launch(self, search: Search, frames: int) -> None:
         """Start all fits of the first ``frames`` frames, whose peaks ``search`` has judged."""

@@ -34,7 +34,7 @@ from headvox.pose.align import (
     weigh,
     weight_of_each,
 )
-from headvox.pose.settle import Refined, assess, column, odds, quaternion_of, settle, turn_between
+from headvox.pose.settle import Refined, assess, column, odds, quaternion_of, recentre, settle, turn_between
 from headvox.pose.template import FINE_MODES, MODES
 from headvox.pose.trials import (
     COARSE_K,
@@ -274,6 +274,7 @@ _settle = on_device(
     settle, np=MATH, quaternion_of=_quaternion_of, turn_between=_turn_between, odds=on_device(odds, np=MATH)
 )
 _assess = on_device(assess)
+_recentre = on_device(recentre, np=MATH)
 _best_of = on_device(best_of, np=MATH)
 
 
@@ -345,6 +346,8 @@ def settle_heads(  # type: ignore[no-untyped-def]
                     refined.told[best, k] = told[0, k]
                 _assess(refined.told[best], more, passes, poses, i)
                 _settle(refined, found[0], best, centre, template, poses, i)
+                if not stands:
+                    _recentre(state, template, poses, i)
         cuda.syncthreads()
 
 

@@ -10,7 +10,8 @@ from headvox.data import F64
 from headvox.machine.kernels import bare_kernel, rule
 from headvox.machine.threads import take
 from headvox.pose.align import COST, CROSSED, EVIDENCE, ON_SURFACE
-from headvox.pose.trials import MORE_POINTS, MORE_RAYS, TRIED, best_of, polish
+from headvox.pose.template import MODES
+from headvox.pose.trials import MORE_POINTS, MORE_RAYS, STANDS, TRIED, best_of, polish
 
 SURE_YAW_RAD = np.radians(45.0)  # an orientation that is less sure is not stated
 
@@ -43,6 +44,8 @@ def finish_all(work, trials, heads, taken, centres, template, poses):  # type: i
             refined = Refined(trials.states[i], trials.told[i], trials.covariances[i])
             assess(trials.told[i, best], counts[MORE_POINTS], counts[MORE_RAYS], poses, i)
             settle(refined, counts[TRIED], best, centres[i], template, poses, i)
+            if not counts[STANDS]:
+                recentre(trials.states[i, best], template, poses, i)
 
 
 @rule
@@ -98,6 +101,18 @@ def settle(refined, count, best, centre, template, poses, i):  # type: ignore[no
         for a in range(3):
             for b in range(3):
                 turn[a, b] = np.nan
+
+
+@rule
+def recentre(state, template, poses, i):  # type: ignore[no-untyped-def]
+    """Move the centre in row ``i`` of ``poses`` to where a head of the shape in ``state`` has it."""
+    scale = np.exp(state[12])
+    for c in range(3):
+        away = template.centre_of_shape[c, 0]
+        for k in range(1 + MODES):
+            away += template.centre_of_shape[c, 1 + k] * state[12 + k]
+        for a in range(3):
+            poses.centres[i, a] += scale * away * state[3 + 3 * a + c]
 
 
 @rule

@@ -24,9 +24,11 @@ class Template(NamedTuple):
     distance (m) for a step of one standard deviation along each mode of shape. ``low`` (3,) is the corner of the first
     voxel, ``radius_m`` that of the sphere that fits the mean head.
 
-    The last three turn what a fit costs into probabilities, learnt from what fits of known heads were off by: two poses
-    whose evidence differs by ``temperature`` are e times as probable, and the covariances of shift and turn are
-    multiplied by ``shift_factor`` and ``turn_factor``.
+    The others are learnt from what fits of known heads were off by. The first three turn what a fit costs into
+    probabilities: two poses whose evidence differs by ``temperature`` are e times as probable, and the covariances of
+    shift and turn are multiplied by ``shift_factor`` and ``turn_factor``. ``centre_of_shape`` (3, 2 + MODES) says where
+    the centre (m) of a head that is seen all around is from the fitted one: a linear function of 1, log scale and
+    modes, in the axes and at the size of the mean head.
     """
 
     rows: F32
@@ -36,6 +38,7 @@ class Template(NamedTuple):
     temperature: float
     shift_factor: float
     turn_factor: float
+    centre_of_shape: F64
 
 
 @lru_cache(maxsize=1)
@@ -47,13 +50,14 @@ def load_template() -> Template:
         modes = asset["modes"] * asset["mode_units_m"].astype(np.float32)[:, None, None, None]
         sigma = asset["sigma"] * np.float32(asset["sigma_unit_m"])
         temperature, shift, turn = (float(v) for v in asset["calibration"])
+        of_shape = asset["centre_of_shape"]
         low, voxel_m, size_m = asset["low_m"], float(asset["voxel_m"]), float(asset["size_m"])
     rows = _aligned((*mean.shape, ROW))
     rows[..., 0] = mean
     rows[..., 1:4] = np.stack(np.gradient(mean, voxel_m), axis=-1)
     rows[..., 4] = sigma
     rows[..., 5 : 5 + MODES] = np.moveaxis(modes, 0, -1)
-    return Template(rows, low, voxel_m, 0.5 * size_m, temperature, shift, turn)
+    return Template(rows, low, voxel_m, 0.5 * size_m, temperature, shift, turn, of_shape)
 
 
 def _aligned(shape: tuple[int, ...]) -> F32:

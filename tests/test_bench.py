@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,6 +17,8 @@ from headvox import cli
 from headvox.bench import command
 from headvox.bench import measure as bench
 from headvox.bench.report import report
+from headvox.masks.cascade import Stage, cuts
+from headvox.masks.read import load_cascade
 from headvox.pipeline import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -116,3 +121,22 @@ def test_the_comparison_of_commits_explains_itself():
     )
     assert done.returncode == 1
     assert done.stderr.startswith("fatal: ")
+
+
+def test_a_cascade_without_some_stages_or_boxes():
+    study = SimpleNamespace(**runpy.run_path(str(ROOT / "bench" / "cascade.py")))
+    cascade = load_cascade("default")
+    first = study.of_first_stages(cascade, 3)
+    assert [stage.name for stage in first.every_stage] == [stage.name for stage in cascade.every_stage[:3]]
+    assert first.judge == first.stages
+    assert study.look_ups(first) < study.look_ups(cascade)
+    assert study.of_first_stages(cascade, len(cascade.every_stage)) == cascade
+    hidden = frozenset(group.name for group in cascade.groups if study.PLACES["hidden"](group))
+    for more in (False, True):
+        blind = study.without(cascade, hidden, more)
+        asked = {f.rpartition(".")[0] for s in blind.every_stage for t in s.trees for f, _ in cuts(t)}
+        assert asked == {group.name for group in cascade.groups} - hidden
+    tree = ("a.sum", 0.5, ("b.sum", 0.1, 1.0, 2.0), 3.0)
+    small = replace(cascade, stages=(Stage("one", 0.0, (tree,)),), judge=())
+    answers = [study.without(small, frozenset({"a"}), more).stages[0].trees[0] for more in (False, True)]
+    assert answers == [("b.sum", 0.1, 1.0, 2.0), 3.0]

@@ -42,10 +42,20 @@ class Outcome:
 
 
 def check(cascade: Path, views: Iterable[View], as_clouds: bool = False) -> Outcome:
-    """Run the detector over ``views``; ``as_clouds`` makes points of the depth images, so nothing is known empty."""
-    detector = Detector(
-        DetectorConfig(cascade=str(cascade), max_range_m=RANGE_M, min_score=LEAST_SCORE, refine="sphere")
+    """Run a detector with the ``cascade`` over ``views``; see :func:`look_at`."""
+    return look_at(views, detector_for(str(cascade)), as_clouds)
+
+
+def detector_for(cascade: str, voxel_m: float | None = None) -> Detector:
+    """Return a detector that tells all heads, however little they score."""
+    config = DetectorConfig(
+        cascade=cascade, max_range_m=RANGE_M, min_score=LEAST_SCORE, refine="sphere", voxel_m=voxel_m
     )
+    return Detector(config)
+
+
+def look_at(views: Iterable[View], detector: Detector, as_clouds: bool = False) -> Outcome:
+    """Run ``detector`` over ``views``; ``as_clouds`` makes points of the depth images, so nothing is known empty."""
     heads: list[F64] = []
     false: list[F64] = []
     frames = 0

@@ -42,10 +42,10 @@ def _height(group: Group) -> float:
 
 
 def of_first_stages(cascade: Cascade, count: int) -> Cascade:
-    """Return a cascade with the first ``count`` stages only, those at peaks last."""
+    """Return a cascade with the first ``count`` stages only, and without the look at full resolution."""
     kept = cascade.every_stage[:count]
-    judge = tuple(stage for stage in cascade.judge if stage in kept)
-    return replace(cascade, stages=tuple(stage for stage in cascade.stages if stage in kept), judge=judge)
+    stages, judge = (tuple(stage for stage in of if stage in kept) for of in (cascade.stages, cascade.judge))
+    return replace(cascade, stages=stages, judge=judge, relief=None)
 
 
 def without(cascade: Cascade, names: frozenset[str], more: bool) -> Cascade:
@@ -112,6 +112,8 @@ def tables(views: list[View], name: str) -> Iterator[str]:
         trees = sum(len(stage.trees) for stage in part.every_stage)
         label = f"{'+ ' if count > 1 else ''}{part.every_stage[-1].name}"
         yield row(label, found(views, part), trees, look_ups(part))
+    if cascade.relief is not None:
+        yield row("+ relief", found(views, cascade), trees + len(cascade.relief.trees), look_ups(cascade))
     yield ""
     yield from table("voxel")
     for voxel_m in VOXELS_M:

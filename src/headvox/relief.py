@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.data import F64, DepthImage, Expected, Heads
-from headvox.frames import inverse
 from headvox.keep import keep
 from headvox.machine.kernels import kernel, read_only, rule
 from headvox.masks.compile import SCORE_UNIT, CompiledRelief
-from headvox.visibility import NEAREST_M, projection
+from headvox.visibility import NEAREST_M, world_to_pixels
 
 I16 = npt.NDArray[np.int16]
 I64 = npt.NDArray[np.int64]
@@ -107,6 +106,8 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):  #
             up[k] = camera[k, 0] * ux + camera[k, 1] * uy + camera[k, 2] * uz
         on = 0
         for k in range(count):
+            if not (on + 2 * (count - k)) / away > best[i]:
+                break  # another camera sees more of it than this one can
             one = spot_at(depth, scale, middle, right, up, spots[k, 0], spots[k, 1], around)
             other = spot_at(depth, scale, middle, right, up, -spots[k, 0], spots[k, 1], around)
             on += (abs(one) <= ON_HEAD) + (abs(other) <= ON_HEAD)
@@ -121,15 +122,19 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):  #
 
 
 @kernel
-def add_trees(relief, nodes, roots, depths, most, gains):  # type: ignore[no-untyped-def]
-    """Write what the trees say of each row of ``relief`` (N, 2 K) to ``gains`` (N,), at most ``most`` either way."""
+def add_trees(relief, best, nodes, roots, depths, most, gains):  # type: ignore[no-untyped-def]
+    """Write what the trees say of each row of ``relief`` (N, 2 K) to ``gains`` (N,), at most ``most`` either way.
+
+    Of what no camera saw (``best`` (N,) is 0) they say nothing.
+    """
     for i in range(relief.shape[0]):
         total = np.int64(0)
-        for t in range(roots.shape[0]):
-            at = roots[t]
-            for _ in range(depths[t]):
-                at = nodes[at + 2 + (relief[i, nodes[at]] > nodes[at + 1])]
-            total += nodes[at + 1]
+        if best[i] > 0.0:
+            for t in range(roots.shape[0]):
+                at = roots[t]
+                for _ in range(depths[t]):
+                    at = nodes[at + 2 + (relief[i, nodes[at]] > nodes[at + 1])]
+                total += nodes[at + 1]
         gains[i] = min(max(total, -most), most)
 
 
@@ -137,11 +142,9 @@ def relief_about(images: Sequence[DepthImage], centres: F64, spots: F64) -> tupl
     """Return the relief (N, 2 K) about ``centres`` (N, 3), mm, and how well a camera saw each (N,); 0: none did."""
     best, relief = np.zeros(len(centres)), np.zeros((len(centres), 2 * len(spots)), np.int16)
     for image in images:
-        lens = image.intrinsics
-        camera = projection(lens) @ inverse(image.T_world_camera)[:3]
-        origin = np.ascontiguousarray(image.T_world_camera[:3, 3])
-        depth = read_only(image.depth)
-        look_closely(depth, lens.depth_scale, camera, origin, centres, spots, best, relief)
+        camera, origin = world_to_pixels(image)
+        scale = image.intrinsics.depth_scale
+        look_closely(read_only(image.depth), scale, camera, origin, centres, spots, best, relief)
     return relief, best
 
 
@@ -149,8 +152,7 @@ def gains_of(images: Sequence[DepthImage], centres: F64, relief: CompiledRelief)
     """Return by how much the scores of what is at ``centres`` (N, 3), world, change, in steps: 0 where none sees it."""
     seen, best = relief_about(images, np.ascontiguousarray(centres), relief.spots)
     gains = np.zeros(len(centres), np.int64)
-    add_trees(seen, relief.nodes, relief.root, relief.depth, relief.most, gains)
-    gains[best == 0.0] = 0
+    add_trees(seen, best, relief.nodes, relief.root, relief.depth, relief.most, gains)
     return gains
 
 
@@ -162,7 +164,8 @@ def look_again(
 
     ``heads`` have no pose yet. For the other numbers, in steps, see :func:`headvox.keep.keep`.
     """
-    scores = np.rint(heads.scores * SCORE_UNIT).astype(np.int64) + gains_of(images, heads.centres, relief)
+    gains = gains_of(images, heads.centres, relief)
+    scores = np.rint(heads.scores * SCORE_UNIT).astype(np.int64) + gains
     kept = np.flatnonzero(keep(heads.centres, scores, least, slack, expected, voxel_m))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     told = Heads(

@@ -9,6 +9,7 @@ need no volume of their own.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -161,8 +162,7 @@ def see_places(images: Sequence[DepthImage], places: F64, sight_m: float) -> npt
     """
     places, states = np.ascontiguousarray(places), np.full(len(places), OUT_OF_VIEW, np.int64)
     for image in images:
-        lens = image.intrinsics
-        camera = projection(lens) @ inverse(image.T_world_camera)[:3]
+        lens, (camera, _) = image.intrinsics, world_to_pixels(image)
         depth = read_only(image.depth)
         look_at_places(depth, camera, lens.fx, lens.fy, lens.depth_scale, places, sight_m, states)
     return states
@@ -171,6 +171,19 @@ def see_places(images: Sequence[DepthImage], places: F64, sight_m: float) -> npt
 def projection(camera: Intrinsics) -> F64:
     """Return the (3, 3) matrix that maps a point of the camera's frame to u·Z, v·Z and Z."""
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def world_to_pixels(image: DepthImage) -> tuple[F64, F64]:
+    """Return the (3, 4) rows that give u·Z, v·Z and Z of a world point, and where the camera stands (3,): read only."""
+    return _world_to_pixels(image.intrinsics, np.asarray(image.T_world_camera, np.float64).tobytes())
+
+
+@lru_cache(maxsize=64)  # cameras mostly stand still
+def _world_to_pixels(lens: Intrinsics, place: bytes) -> tuple[F64, F64]:
+    T = np.frombuffer(place).reshape(4, 4)
+    camera, origin = projection(lens) @ inverse(T)[:3], T[:3, 3].copy()
+    camera.flags.writeable = origin.flags.writeable = False
+    return camera, origin
 
 
 def camera_table(image: DepthImage, lattice: Lattice) -> F32:

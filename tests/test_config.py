@@ -96,6 +96,7 @@ def test_a_missing_file(tmp_path):
         ({"threads": "2"}, "threads: expected a whole number"),
         ({"cascade": None}, "cascade: expected text"),
         ({"max_range_m": "far"}, "max_range_m: expected a number"),
+        ({"max_range_m": 10**400}, "max_range_m: expected a number"),
         ({"max_range_m": None}, "max_range_m: expected a number"),
         ({"centre": (0.0, 0.0)}, "centre: expected three"),
         ({"centre": (0.0, 0.0, math.inf)}, "centre"),

@@ -208,8 +208,12 @@ def _check_type(key: str, value: object) -> None:
 
 
 def _is_number(value: object, most: float) -> bool:
-    # The type checker knows no order of numbers.Real, which NumPy's scalars are, too.
-    return not isinstance(value, bool) and isinstance(value, Real) and -most <= value <= most  # type: ignore[operator]
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    try:
+        return -most <= float(value) <= most
+    except OverflowError:  # a whole number that is greater than any float
+        return False
 
 
 def to_toml(config: DetectorConfig | TrackerConfig) -> str:

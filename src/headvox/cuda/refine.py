@@ -50,7 +50,7 @@ def joined(low, high):  # type: ignore[no-untyped-def]
 @device
 def centre_of(place, S, origin, voxel_m, axis):  # type: ignore[no-untyped-def]
     """Return a coordinate of the centre of the voxel at ``place``, world, metres: as the CPU has it."""
-    return product_64(cell_of(place, S)[axis] + 0.5, voxel_m) + origin[axis]  # type: ignore[no-untyped-call]
+    return product_64(cell_of(place, S)[axis] + 0.5, voxel_m) + origin[axis]
 
 
 @kernel
@@ -76,7 +76,7 @@ def keep(S, whole, wide, octets, counts, places, scores, voxel_m, kept):  # type
                 squared = 0.0
                 for axis in range(3):
                     away = centre_of(place, volume, origin, voxel_m, axis) - octets[frame, first + e, axis]
-                    squared += product_64(away, away)  # type: ignore[no-untyped-call]
+                    squared += product_64(away, away)
                 is_head = is_head or MATH.sqrt(squared) <= octets[frame, first + e, 7] + voxel_m
         if is_head:
             kept[frame, found] = i
@@ -166,7 +166,7 @@ def suppress_overlaps(counts, scores, kept, spheres, distance_m, order, heads): 
             j, squared = heads[frame, k], 0.0
             for axis in range(3):
                 away = spheres[frame, i, axis] - spheres[frame, j, axis]
-                squared += product_64(away, away)  # type: ignore[no-untyped-call]
+                squared += product_64(away, away)
             alone = alone and squared >= distance_m * distance_m
         if alone:
             heads[frame, found] = i

@@ -34,6 +34,7 @@ class Lanes(types.Type):
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
         scalar = dmm.lookup(fe_type.scalar).get_value_type()
+        # The base class, of Numba, has no type hints.
         super().__init__(dmm, fe_type, ir.VectorType(scalar, LANES))  # type: ignore[no-untyped-call]
 
 

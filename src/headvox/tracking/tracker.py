@@ -1,7 +1,7 @@
 """From heads to tracks: who is who, where everybody is now, and how fast.
 
-A frame is five steps: predict, associate, correct, age, bear (:meth:`Tracker.update`). The filters are in
-``kalman.py``, what tells people apart in ``identity.py``, how far measured heads may be off in ``noise.py``. Where a
+A frame is five steps: predict, associate, correct, look again and age, bear (:meth:`Tracker.update`). The filters are
+in ``kalman.py``, what tells people apart in ``identity.py``, how far measured heads may be off in ``noise.py``. Where a
 head may be that was not found is in ``unseen.py``, what keeps its track alive in ``lifetime.py``: it dies fast where
 all is seen to be empty, later where it is hidden. What is known of each track is a row of a table (``roster.py``), what
 is told of it is in ``report.py``.

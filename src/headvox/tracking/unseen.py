@@ -21,19 +21,16 @@ SIDE = 2 * STEPS + 1
 SAMPLES = 2 * SIDE * SIDE  # of a track: the still model's, then the moving one's
 PRIOR = np.exp(-0.5 * (STEP * np.arange(-STEPS, STEPS + 1)) ** 2)
 PRIOR /= PRIOR.sum()
-VARIANCE = float(
-    (PRIOR * (STEP * np.arange(-STEPS, STEPS + 1)) ** 2).sum()
-)  # of the samples, before any evidence
+# Of the samples, before any evidence.
+VARIANCE = float((PRIOR * (STEP * np.arange(-STEPS, STEPS + 1)) ** 2).sum())
 
 # How likely a reading is where a head is that was missed, over how likely it is where none is: near 0 where the sensors
 # saw through, and less than elsewhere out of their view: most who are missed are not just walking out of it.
 LIKELY = np.ones(SEEN_EMPTY + 1)
 LIKELY[OUT_OF_VIEW], LIKELY[SEEN_EMPTY] = 0.15, 0.02
 TAKEN_M = 0.2  # nearer than this to another head there is none
-TAKEN, DISPUTED = (
-    0.02,
-    0.2,
-)  # how likely that is all the same: where one was found, and where one is missed, too
+# How likely that is all the same: where one was found, and where one is missed, too.
+TAKEN, DISPUTED = 0.02, 0.2
 KNOWN_M = 0.4  # one that is missed claims its place only if it is known as well as this
 GONE = 0.05  # so little left of a track: it is nowhere
 RIGHT_M, LEAST_SURE = 0.3, 0.5  # a track is stated where it is likelier than not that its head is so near

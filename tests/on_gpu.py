@@ -1,6 +1,6 @@
 """The search on a GPU, or in Numba's simulator of one: test_cuda.py runs this file in a process of its own.
 
-Every kernel equals the CPU's loops, which equal the slow twins (naive.py), bit for bit.
+Every kernel equals the CPU's loops, which equal the slow twins (naive*.py), bit for bit.
 """
 
 import math

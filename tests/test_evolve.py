@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from itertools import product
 
-import naive
+import naive_voxels
 import numpy as np
 import pytest
 
@@ -116,15 +116,17 @@ def test_every_kind_of_view_can_be_made():
 def test_features_are_the_sorted_sums_of_the_naive_twin():
     rng = np.random.default_rng(0)
     cells = (rng.random((24, 24, 24)) < 0.2) * rng.integers(0, 256, (24, 24, 24))
-    amount = naive.weights(cells.astype(np.uint8))
-    S = naive.integral_volume(amount)
+    amount = naive_voxels.weights(cells.astype(np.uint8))
+    S = naive_voxels.integral_volume(amount)
     where = np.array([[12, 12, 12], [3, 20, 8], [0, 0, 0], [23, 23, 23]], np.int32)
     found = bank.OCCUPIED.features(bank.sums_about(S, where, bank.OCCUPIED.boxes))
     for row, cell in zip(found, where, strict=True):
         wanted = []
         for group in bank.OCCUPIED.groups:
             sums = sorted(
-                naive.box_sum(amount, naive.about(cell, naive.voxel_box(box, bank.VOXEL_M)))
+                naive_voxels.box_sum(
+                    amount, naive_voxels.about(cell, naive_voxels.voxel_box(box, bank.VOXEL_M))
+                )
                 for box in group.boxes
             )
             wanted += [sums[0], sums[2], sums[-3], sums[-1]] if len(sums) > 1 else []

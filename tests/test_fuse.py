@@ -1,4 +1,4 @@
-import naive
+import naive_voxels
 import numpy as np
 import pytest
 import scenes
@@ -14,7 +14,7 @@ def test_equals_the_naive_twin(seed):
     region = scenes.region(centre=tuple(rng.uniform(-0.2, 0.2, 3)))
     fused = fuse(clouds, region)
     assert len(fused) > 100
-    assert fused.tobytes() == naive.fuse(clouds, region).tobytes()
+    assert fused.tobytes() == naive_voxels.fuse(clouds, region).tobytes()
 
 
 def test_nothing_in_gives_nothing_out():

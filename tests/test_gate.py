@@ -1,7 +1,8 @@
 from dataclasses import replace
 from itertools import product
 
-import naive
+import naive_search
+import naive_voxels
 import numpy as np
 import pytest
 import scenes
@@ -42,7 +43,7 @@ def cascade_with(gate: str, subdivision: int = 2, occupancy: str = "parts"):
 def same_survivors(cells, cascade, voxel=None):
     """Assert that the survivors equal those of the twin, in order; return them."""
     compiled = compile_cascade(cascade, voxel)
-    wanted = naive.gate(naive.weights(cells), cascade, voxel or cascade.voxel_m)
+    wanted = naive_search.gate(naive_voxels.weights(cells), cascade, voxel or cascade.voxel_m)
     survivors = pass_gate(integral_volume(cells), compiled.gate)
     assert survivors.dtype == np.int32
     np.testing.assert_array_equal(survivors, wanted)
@@ -152,7 +153,7 @@ max = 0.6
 """
     cells = random_cells(rng, (32, 30, 22), 0.9) | np.uint8(0xF1)
     cells[:, :, 9:13] = 0
-    assert naive.weights(cells).sum() > 0xFFFF
+    assert naive_voxels.weights(cells).sum() > 0xFFFF
     assert len(same_survivors(cells, cascade_with(gate))) > 100
 
 
@@ -202,7 +203,7 @@ def test_some_voxels_equal_the_naive_twin_and_the_lattices_together_are_the_whol
     together = []
     for odd in product((0, 1), repeat=3):
         found = pass_gate(S, gate, odd)
-        np.testing.assert_array_equal(found, naive.gate(naive.weights(cells), some, 0.02, odd))
+        np.testing.assert_array_equal(found, naive_search.gate(naive_voxels.weights(cells), some, 0.02, odd))
         assert 0 < len(found) < len(whole)
         together += map(tuple, found.tolist())
     assert sorted(together) == sorted([*map(tuple, whole.tolist())] * (8 // spacing))
@@ -223,7 +224,7 @@ def test_shares_of_a_part_of_the_volume_are_together_that_part(spacing, shape):
     for odd in ((0, 0, 0), (1, 0, 1), (0, 1, 1)):
         low = rng.integers(0, np.array(shape) // 2)
         high = rng.integers(low + 1, shape, endpoint=True)
-        whole = naive.gate(naive.weights(cells), cascade, 0.02, odd)
+        whole = naive_search.gate(naive_voxels.weights(cells), cascade, 0.02, odd)
         wanted = whole[((whole >= low) & (whole < high)).all(axis=1)]
         region = np.stack([low, high], axis=1).reshape(-1) + margin.repeat(2)
         for parts in (1, 2, 3):

@@ -1,4 +1,4 @@
-import naive
+import naive_voxels
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -35,10 +35,10 @@ def test_equals_the_naive_twin(shape, dtype, filled):
     cells = np.where(rng.random(shape) < filled, rng.integers(0, 256, shape), 0).astype(dtype)
     S = integral_volume(cells)
     assert S.dtype == np.uint32
-    np.testing.assert_array_equal(S, naive.integral_volume(cells))
+    np.testing.assert_array_equal(S, naive_voxels.integral_volume(cells))
     boxes = random_boxes(rng, shape)
-    amount = naive.weights(cells)
-    np.testing.assert_array_equal(box_sums(S, boxes), [naive.box_sum(amount, box) for box in boxes])
+    amount = naive_voxels.weights(cells)
+    np.testing.assert_array_equal(box_sums(S, boxes), [naive_voxels.box_sum(amount, box) for box in boxes])
 
 
 def part_of(cells, box, first, shape, dtype, threads=1):
@@ -63,7 +63,8 @@ def test_box_sums_are_exact_though_the_volume_overflows_32_bits(most, seed):
     boxes = random_boxes(rng, cells.shape, 60)
     boxes[:, 1::2] = np.minimum(boxes[:, 1::2], boxes[:, 0::2] + 2)  # eight cells at most: the sum fits
     np.testing.assert_array_equal(
-        box_sums(integral_volume(cells), boxes), [naive.box_sum(cells.astype(np.int64), box) for box in boxes]
+        box_sums(integral_volume(cells), boxes),
+        [naive_voxels.box_sum(cells.astype(np.int64), box) for box in boxes],
     )
 
 
@@ -73,11 +74,11 @@ def test_box_sums_are_exact_though_the_volume_overflows_16_bits():
     cells[rng.random(cells.shape) < 0.1] = 0
     S = integral_volume(cells, narrow=True)
     assert S.dtype == np.uint16
-    amount = naive.weights(cells)
+    amount = naive_voxels.weights(cells)
     assert amount.sum() > 2 * 0xFFFF
     boxes = random_boxes(rng, cells.shape)
     boxes = np.concatenate([boxes, [[0, 20, 0, 20, 0, 20], [20, 60, 10, 60, 0, 60]]])
-    wanted = np.array([naive.box_sum(amount, box) for box in boxes])
+    wanted = np.array([naive_voxels.box_sum(amount, box) for box in boxes])
     fits = wanted <= 0xFFFF
     assert fits.sum() > 300
     np.testing.assert_array_equal(box_sums(S, boxes[fits]), wanted[fits])
@@ -93,7 +94,7 @@ def test_a_part_of_the_grid(counting, threads, height):
     cells[rng.random(cells.shape) < 0.5] = 0
     for low, high in ((0, height - 1), (3, height - 2), (1, 1)):
         S = part_of(cells, [2, 1, low, 7, 7, high], [2, 1, low], (7, 8, 64), np.uint32, threads)
-        wanted = naive.integral_volume(cells[2:8, 1:8, low : high + 1])
+        wanted = naive_voxels.integral_volume(cells[2:8, 1:8, low : high + 1])
         np.testing.assert_array_equal(S[:, :, : high - low + 2], wanted)
         assert (S[:, :, high - low + 2 :] == wanted[:, :, -1:]).all()
 
@@ -120,7 +121,7 @@ def test_a_volume_wider_than_its_cells_goes_on_over_empty_ones(dtype, threads):
     S = part_of(cells, [1, 1, 2, 4, 3, 7], [-1, -2, -3], (9, 8, 32), dtype, threads)
     wider = np.zeros((8, 7, 31), np.uint8)
     wider[2:6, 3:6, 5:11] = cells[1:5, 1:4, 2:8]
-    np.testing.assert_array_equal(S, naive.integral_volume(wider))
+    np.testing.assert_array_equal(S, naive_voxels.integral_volume(wider))
 
 
 def test_with_margins_every_box_about_every_voxel_lies_in_the_volume():
@@ -133,12 +134,12 @@ def test_with_margins_every_box_about_every_voxel_lies_in_the_volume():
     assert S.shape == shape_with_margins(cells.shape, reach) == (9, 8, 96)
     corners = np.empty((2, 8), np.int64)
     set_corners(S, boxes, corners)
-    amount, flat = naive.weights(cells), S.reshape(-1).astype(np.int64)
+    amount, flat = naive_voxels.weights(cells), S.reshape(-1).astype(np.int64)
     for x, y, z in np.argwhere(cells >= 0).tolist():
         at = ((x + 2) * S.shape[1] + y + 1) * S.shape[2] + (z + 3) // 2
         is_odd = (z + 3) % 2 == 1
         for box, (*columns, z0, z0_if_odd, z1, z1_if_odd) in zip(boxes, corners.tolist(), strict=True):
             low, high = at + z0 + z0_if_odd * is_odd, at + z1 + z1_if_odd * is_odd
             a, b, c, d = (flat[high + column] - flat[low + column] for column in columns)
-            wanted = naive.box_sum(amount, naive.about((x, y, z), box))
+            wanted = naive_voxels.box_sum(amount, naive_voxels.about((x, y, z), box))
             assert (a - b - (c - d)) % 2**32 == wanted

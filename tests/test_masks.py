@@ -1,7 +1,7 @@
 import copy
 from dataclasses import replace
 
-import naive
+import naive_voxels
 import numpy as np
 import pytest
 import scenes
@@ -28,7 +28,7 @@ STAGES, VOTES = tomllib.loads(scenes.STAGES), tomllib.loads(scenes.VOTES)
 def test_ranges_equal_the_naive_twin(voxel, centre, size):
     """Centres and sizes in half centimetres."""
     c, s = centre * 0.005, size * 0.005
-    assert voxel_range(c, s, voxel) == naive.voxel_range(c, s, voxel)
+    assert voxel_range(c, s, voxel) == naive_voxels.voxel_range(c, s, voxel)
 
 
 @pytest.mark.parametrize("voxel", VOXELS)
@@ -89,16 +89,20 @@ def test_shipped_cascades_compile_and_fit_their_type(name, voxel):
     assert compiled.voxel_m == v
     unit = 1 if cascade.counting else cascade.subdivision**3
     wanted = [box for c in cascade.conditions for box in c.group.boxes]
-    assert compiled.gate.boxes.tolist() == [naive.voxel_box(box, v) for box in wanted]
+    assert compiled.gate.boxes.tolist() == [naive_voxels.voxel_box(box, v) for box in wanted]
     for condition in cascade.conditions:
-        boxes = [naive.voxel_box(box, v) for box in condition.group.boxes]
-        total = sum(map(naive.volume, boxes)) if condition.rank == 0 else max(map(naive.volume, boxes))
+        boxes = [naive_voxels.voxel_box(box, v) for box in condition.group.boxes]
+        total = (
+            sum(map(naive_voxels.volume, boxes))
+            if condition.rank == 0
+            else max(map(naive_voxels.volume, boxes))
+        )
         assert total * unit <= compiled.largest_sum
     for table in (t.boxes for t in (compiled.stages, compiled.votes) if t is not None):
-        assert max(map(naive.volume, table.tolist())) * unit <= compiled.largest_sum
+        assert max(map(naive_voxels.volume, table.tolist())) * unit <= compiled.largest_sum
     if compiled.votes is not None and compiled.votes.pairs.size:
         assert (
-            max(map(naive.volume, compiled.votes.pairs.reshape(-1, 6).tolist())) * unit
+            max(map(naive_voxels.volume, compiled.votes.pairs.reshape(-1, 6).tolist())) * unit
             <= compiled.largest_sum
         )
     full = integral_volume(np.full((3, 3, 3), 1 if cascade.subdivision == 1 else 255, np.uint8))

@@ -1,4 +1,4 @@
-import naive
+import naive_sphere
 import numpy as np
 import pytest
 import scenes
@@ -34,7 +34,7 @@ def test_equals_the_naive_twin(seed, voxel, subdivision, counting):
         [0, 0, 0],
         np.array(lattice.shape) - 1,
     ]
-    wanted = naive.fit_spheres(cells, peaks, voxel, subdivision)
+    wanted = naive_sphere.fit_spheres(cells, peaks, voxel, subdivision)
     spheres = fitted(cells, peaks, voxel, subdivision, counting)
     np.testing.assert_allclose(spheres, wanted, rtol=1e-9, atol=1e-9)
     assert spheres[0, 5] > 20
@@ -62,7 +62,7 @@ def test_one_part_and_a_part_at_the_very_centre():
     cells = np.zeros((9, 9, 9), np.uint8)
     cells[6, 4, 4] = 1
     np.testing.assert_allclose(
-        fitted(cells, [[4, 4, 4]]), naive.fit_spheres(cells, [[4, 4, 4]], 0.05, 2), atol=1e-9
+        fitted(cells, [[4, 4, 4]]), naive_sphere.fit_spheres(cells, [[4, 4, 4]], 0.05, 2), atol=1e-9
     )
     lone = np.zeros((9, 9, 9), np.uint32)
     lone[4, 4, 4] = 5

@@ -1,4 +1,4 @@
-import naive
+import naive_search
 import numpy as np
 import pytest
 
@@ -15,7 +15,7 @@ def test_equals_the_naive_twin(seed, values, reach):
     scores = rng.integers(-values, values, len(cells))
     for least in (-(2**40) + 1, 0):
         peaks = suppress(cells, scores, least, shape, reach)
-        np.testing.assert_array_equal(peaks, naive.suppress(cells, scores, least, reach))
+        np.testing.assert_array_equal(peaks, naive_search.suppress(cells, scores, least, reach))
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -26,7 +26,7 @@ def test_the_best_of_each_group_equals_the_naive_twin(seed, values):
     scores = rng.integers(-values, values, len(cells))
     for least in (-values, 0, values + 1):
         best = np.empty(20, np.int64)
-        wanted = naive.best_of_each(cells, scores, 7, least)
+        wanted = naive_search.best_of_each(cells, scores, 7, least)
         assert best[: best_of_each(cells, scores, 7, least, best)].tolist() == wanted
         assert len(wanted) < 20
 
@@ -54,7 +54,7 @@ def test_overlaps_equal_the_naive_twin(seed):
     centres = rng.uniform(-0.5, 0.5, (40, 3))
     scores = rng.integers(0, 5, 40)
     kept = suppress_overlaps(centres, scores, 0.3)
-    np.testing.assert_array_equal(kept, naive.suppress_overlaps(centres, scores, 0.3))
+    np.testing.assert_array_equal(kept, naive_search.suppress_overlaps(centres, scores, 0.3))
     assert 1 < len(kept) < 40
 
 

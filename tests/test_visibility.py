@@ -1,4 +1,5 @@
-import naive
+import naive_visibility
+import naive_voxels
 import numpy as np
 import pytest
 import scenes
@@ -29,7 +30,9 @@ def test_equals_the_naive_twin(subdivision, count):
     lattice = Lattice.over(REGION, 0.05, subdivision)
     cells = np.column_stack([rng.integers(-2, n + 2, 40) for n in lattice.shape]).astype(np.int32)
     seen = count_seen(images, lattice, cells, BOXES)
-    wanted = naive.count_seen(images, naive.lattice_over(REGION, 0.05, subdivision), cells, BOXES)
+    wanted = naive_visibility.count_seen(
+        images, naive_voxels.lattice_over(REGION, 0.05, subdivision), cells, BOXES
+    )
     np.testing.assert_array_equal(seen, wanted)
     assert seen[..., 0].max() > 5
     assert seen[..., 1].max() > 5
@@ -46,7 +49,7 @@ def test_turned_cameras_equal_the_naive_twin():
     cells = np.column_stack([rng.integers(0, n, 60) for n in lattice.shape]).astype(np.int32)
     seen = count_seen(images, lattice, cells, BOXES)
     np.testing.assert_array_equal(
-        seen, naive.count_seen(images, naive.lattice_over(REGION, 0.05, 2), cells, BOXES)
+        seen, naive_visibility.count_seen(images, naive_voxels.lattice_over(REGION, 0.05, 2), cells, BOXES)
     )
     assert seen.sum() > 100
 
@@ -70,7 +73,7 @@ def test_depths_about_the_margins_equal_the_naive_twin():
     )
     cells = np.argwhere(np.ones(lattice.shape)).astype(np.int32)
     one = np.array([[0, 1, 0, 1, 0, 1]], np.int32)
-    wanted = naive.count_seen((image,), naive.lattice_over(REGION, 0.05, 1), cells, one)
+    wanted = naive_visibility.count_seen((image,), naive_voxels.lattice_over(REGION, 0.05, 1), cells, one)
     np.testing.assert_array_equal(count_seen((image,), lattice, cells, one), wanted)
     assert wanted.sum(axis=(0, 1)).min() > 1000
 
@@ -164,7 +167,7 @@ def test_places_equal_the_naive_twin(count):
     images = [patchy(rng, T @ np.linalg.matrix_power(aside, k)) for k in range(count)]
     places = places_about(rng, SMALL, T, 3000)
     seen = see_places(images, places, SIGHT_M)
-    np.testing.assert_array_equal(seen, naive.see_places(images, places, SIGHT_M))
+    np.testing.assert_array_equal(seen, naive_visibility.see_places(images, places, SIGHT_M))
     kinds = (OUT_OF_VIEW, NO_RETURN, BEHIND, SURFACE, SEEN_EMPTY) if count else (OUT_OF_VIEW,)
     assert min((seen == kind).sum() for kind in kinds) >= 8
 
@@ -177,7 +180,7 @@ def test_places_without_a_turn_equal_the_naive_twin_on_the_borders_of_pixels():
     u, v = rng.integers(-4, 84, 3000) / 2.0, rng.integers(-4, 64, 3000) / 2.0
     places = np.stack([(u - 19.5) / 32.0 * far, (v - 14.5) / 32.0 * far, far], 1)
     seen = see_places([image], places, SIGHT_M)
-    np.testing.assert_array_equal(seen, naive.see_places([image], places, SIGHT_M))
+    np.testing.assert_array_equal(seen, naive_visibility.see_places([image], places, SIGHT_M))
     assert min((seen == kind).sum() for kind in range(5)) >= 20
 
 

@@ -1,6 +1,8 @@
 from dataclasses import replace
 
-import naive
+import naive_search
+import naive_visibility
+import naive_voxels
 import numpy as np
 import pytest
 import scenes
@@ -42,7 +44,10 @@ def test_votes_equal_the_naive_twin(seed, voxel):
     cells = some_cells(rng, grid.shape, 80)
     compiled = compile_cascade(SMALL_VOTES, voxel)
     scores, yaws = score_by_votes(integral_volume(grid), cells, compiled.votes)
-    wanted = [naive.score_by_votes(naive.weights(grid), cell, SMALL_VOTES.votes, voxel) for cell in cells]
+    wanted = [
+        naive_search.score_by_votes(naive_voxels.weights(grid), cell, SMALL_VOTES.votes, voxel)
+        for cell in cells
+    ]
     assert scores.tolist() == [score for score, _ in wanted]
     assert yaws.tolist() == [yaw for _, yaw in wanted]
     assert len(set(yaws.tolist())) > 1
@@ -55,7 +60,7 @@ def test_too_few_votes_drop_a_candidate():
     grid = random_cells(rng, (9, 9, 9), 0.1, counting=True)
     cells = some_cells(rng, grid.shape, 60)
     scores, _ = score_by_votes(integral_volume(grid), cells, compile_cascade(cascade).votes)
-    wanted = [naive.score_by_votes(naive.weights(grid), cell, votes, 0.05)[0] for cell in cells]
+    wanted = [naive_search.score_by_votes(naive_voxels.weights(grid), cell, votes, 0.05)[0] for cell in cells]
     assert scores.tolist() == wanted
     assert 0 < (scores == DROPPED).sum() < 60
 
@@ -69,7 +74,9 @@ def test_votes_of_an_empty_volume_and_of_no_candidate():
 
 def test_mirrored_pairs_count_for_the_type_of_the_volume():
     pairs = max(
-        naive.volume(naive.voxel_box(box, 0.05)) for pair in SMALL_VOTES.votes.mirrored for box in pair
+        naive_voxels.volume(naive_voxels.voxel_box(box, 0.05))
+        for pair in SMALL_VOTES.votes.mirrored
+        for box in pair
     )
     assert pairs == 12**3
     assert compile_cascade(SMALL_VOTES).largest_sum >= pairs
@@ -89,9 +96,12 @@ def test_stages_equal_the_naive_twin(seed, voxel, seeing):
     seen = None
     if seeing:
         boxes, _ = seen_boxes(stages)
-        seen = np.array([[naive.count_in(states, naive.about(c, b)) for b in boxes] for c in cells], np.int32)
-    amount = naive.weights(grid)
-    wanted = [naive.score_by_stages(amount, cell, SMALL, voxel, states, seeing) for cell in cells]
+        seen = np.array(
+            [[naive_visibility.count_in(states, naive_voxels.about(c, b)) for b in boxes] for c in cells],
+            np.int32,
+        )
+    amount = naive_voxels.weights(grid)
+    wanted = [naive_search.score_by_stages(amount, cell, SMALL, voxel, states, seeing) for cell in cells]
     for S in volumes(grid, compiled):
         assert score_by_stages(S, cells, stages, seen).tolist() == wanted
     assert len(set(wanted)) > 2
@@ -129,12 +139,16 @@ def test_random_trees_equal_the_naive_twin(seed):
     compiled = compile_cascade(cascade)
     states = MadeUp()
     boxes, _ = seen_boxes(compiled.stages)
-    seen = np.array([[naive.count_in(states, naive.about(c, b)) for b in boxes] for c in cells], np.int32)
+    seen = np.array(
+        [[naive_visibility.count_in(states, naive_voxels.about(c, b)) for b in boxes] for c in cells],
+        np.int32,
+    )
     seen = seen.reshape(len(cells), -1, 2)
     S = integral_volume(grid)
     for known, states_known in ((seen, states), (None, None)):
         wanted = [
-            naive.score_by_stages(naive.weights(grid), cell, cascade, 0.05, states_known) for cell in cells
+            naive_search.score_by_stages(naive_voxels.weights(grid), cell, cascade, 0.05, states_known)
+            for cell in cells
         ]
         assert score_by_stages(S, cells, compiled.stages, known).tolist() == wanted
 
@@ -163,7 +177,7 @@ def test_a_candidate_is_dropped_below_keep_and_not_at_it(keep):
     cells[:] = 2
     score = score_by_stages(integral_volume(grid), cells, compile_cascade(cascade).stages)
     assert score.tolist() == [0 if keep <= 0.0 else DROPPED]
-    assert score[0] == naive.score_by_stages(naive.weights(grid), cells[0], cascade, 0.05)
+    assert score[0] == naive_search.score_by_stages(naive_voxels.weights(grid), cells[0], cascade, 0.05)
 
 
 @pytest.mark.parametrize("name", shipped_cascades())
@@ -173,16 +187,20 @@ def test_shipped_cascades_equal_the_naive_twin(name):
     rng = np.random.default_rng(7)
     grid = random_cells(rng, (15, 15, 15), 0.2, cascade.counting)
     cells = some_cells(rng, grid.shape, 12)
-    amount = naive.weights(grid)
+    amount = naive_voxels.weights(grid)
     for S in volumes(grid, compiled):
         if cascade.votes is not None:
             scores, yaws = score_by_votes(S, cells, compiled.votes)
-            wanted = [naive.score_by_votes(amount, cell, cascade.votes, cascade.voxel_m) for cell in cells]
+            wanted = [
+                naive_search.score_by_votes(amount, cell, cascade.votes, cascade.voxel_m) for cell in cells
+            ]
             assert list(zip(scores.tolist(), yaws.tolist(), strict=True)) == wanted
         else:
             kept = replace(cascade, stages=tuple(replace(stage, keep=-1e6) for stage in cascade.stages))
             for version in (cascade, kept):  # the second so that the last stage is reached
-                wanted = [naive.score_by_stages(amount, cell, version, cascade.voxel_m) for cell in cells]
+                wanted = [
+                    naive_search.score_by_stages(amount, cell, version, cascade.voxel_m) for cell in cells
+                ]
                 assert score_by_stages(S, cells, compile_cascade(version).stages).tolist() == wanted
 
 

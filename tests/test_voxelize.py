@@ -1,6 +1,6 @@
 import math
 
-import naive
+import naive_voxels
 import numpy as np
 import pytest
 import scenes
@@ -28,7 +28,7 @@ from headvox.voxelize import (
 def same_grids(thing, region, voxel=0.05, subdivision=2):
     """Assert that both kinds of grid equal their twins; return the count grid."""
     lattice = Lattice.over(region, voxel, subdivision)
-    grid = naive.Grid(naive.lattice_over(region, voxel, subdivision))
+    grid = naive_voxels.Grid(naive_voxels.lattice_over(region, voxel, subdivision))
     if isinstance(thing, Cloud):
         grid.enter_cloud(thing)
         parts, counts = voxelize_points(thing, lattice), voxelize_points(thing, lattice, count=True)
@@ -58,7 +58,10 @@ finite = st.floats(-20.0, 20.0, allow_nan=False)
 @settings(max_examples=200, deadline=None, derandomize=True)
 def test_lattice_equals_the_naive_twin_and_covers_its_region(centre, radius, low, height, voxel, subdivision):
     region = Region(centre, radius, low, low + height)
-    lattice, twin = Lattice.over(region, voxel, subdivision), naive.lattice_over(region, voxel, subdivision)
+    lattice, twin = (
+        Lattice.over(region, voxel, subdivision),
+        naive_voxels.lattice_over(region, voxel, subdivision),
+    )
     assert lattice.origin == twin.origin
     assert lattice.shape == twin.shape
     assert lattice.part_m == twin.part

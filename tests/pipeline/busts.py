@@ -1,0 +1,27 @@
+"""What the detectors of these tests look at, and the bytes of what they find."""
+
+import numpy as np
+import scenes
+
+from headvox import Frame, Heads
+
+
+def everything(heads: Heads) -> tuple[bytes, ...]:
+    return tuple(a.tobytes() for a in (heads.centres, heads.quaternions, heads.radii, heads.scores))
+
+
+def two_busts(seed=0):
+    rng = np.random.default_rng(seed)
+    return np.concatenate(
+        [scenes.bust(rng, (-0.25, -0.2, 0.1), 400), scenes.bust(rng, (0.25, 0.25, 0.15), 400)]
+    )
+
+
+def camera_frame(seed=0, count=1):
+    rng = np.random.default_rng(seed)
+    spheres = [(0.1, -0.15, 0.1, 0.1), (0.1, -0.15, -0.2, 0.17), (0.3, 0.25, 0.15, 0.1)]
+    places = [scenes.looking_along_x(-0.9, 0.0, 0.1), scenes.looking_along_x(-0.8, 0.3, 0.2)]
+    images = [
+        scenes.image_of_spheres(rng, T, spheres, 1.7, name=f"c{k}") for k, T in enumerate(places[:count])
+    ]
+    return Frame(0, depths=tuple(images))

@@ -1,0 +1,38 @@
+import pytest
+import scenes
+
+from headvox import Detector
+from headvox.config import DetectorConfig
+
+SMALL = {
+    "max_range_m": 0.7,
+    "min_height_m": -0.5,
+    "max_height_m": 0.5,
+    "centre": (0.0, 0.0, 0.0),
+    "refine": "sphere",
+}
+
+
+@pytest.fixture(scope="session")
+def cascades(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cascades")
+    (folder / "stages.toml").write_text(scenes.STAGES, encoding="utf-8")
+    fourth = scenes.STAGES.replace("min_score =", 'candidates = "every fourth"\nmin_score =', 1)
+    (folder / "fourth.toml").write_text(fourth, encoding="utf-8")
+    (folder / "votes.toml").write_text(scenes.VOTES, encoding="utf-8")
+    names = ("stages", "fourth", "votes")
+    return {name: str(folder / f"{name}.toml") for name in names}
+
+
+@pytest.fixture
+def make(cascades):
+    """Return a function that makes a detector, and end its threads afterwards."""
+    made = []
+
+    def make(cascade="stages", **settings):
+        made.append(Detector(DetectorConfig(cascade=cascades.get(cascade, cascade), **{**SMALL, **settings})))
+        return made[-1]
+
+    yield make
+    for detector in made:
+        detector.close()

@@ -1,0 +1,167 @@
+"""What a detector takes, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from busts import camera_frame, everything, two_busts
+
+from headvox import Cloud, DepthImage, Detector, Frame, Heads, HeadvoxError, Intrinsics
+from headvox.config import DetectorConfig
+from headvox.data import BadFrame
+from headvox.masks.read import parse_cascade
+
+
+def test_one_point_is_no_head(make):
+    heads = make().detect(np.zeros((1, 3), np.float32))
+    assert len(heads) == 0
+    assert heads.centres.shape == (0, 3)
+    assert heads.quaternions.shape == (0, 4)
+    assert list(heads) == []
+
+
+def test_a_million_points_in_one_place(make):
+    cloud = np.concatenate([two_busts(), np.tile(np.float32([[0.0, 0.0, 0.4]]), (1_000_000, 1))])
+    for cascade in ("stages", "votes"):
+        detector = make(cascade, min_score=-2.0)
+        once = detector.detect(cloud[: len(two_busts()) + 1])
+        many = detector.detect(cloud)
+        if cascade == "stages":
+            assert everything(many) == everything(once)
+        assert np.isfinite(many.centres).all()
+
+
+def test_points_and_images_that_may_not_be_written(make):
+    cloud = two_busts()
+    detector = make(min_score=-2.0)
+    wanted = everything(detector.detect(cloud))
+    cloud.flags.writeable = False
+    assert everything(detector.detect(cloud)) == wanted
+
+
+def test_a_bad_point_among_good_ones_is_passed_over(make):
+    cloud = two_busts()
+    bad = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e30, 0, 0], [0, -3e38, 0]], np.float32)
+    detector = make(min_score=-2.0)
+    wanted = everything(detector.detect(cloud))
+    assert everything(detector.detect(np.concatenate([bad, cloud, bad]))) == wanted
+
+
+def depth_image(depth, **camera):
+    shape = depth.shape if isinstance(depth, np.ndarray) and depth.ndim == 2 else (2, 3)
+    values = {"width": shape[1], "height": shape[0], "fx": 2.0, "fy": 2.0, "cx": 1.0, "cy": 1.0, **camera}
+    return DepthImage("left", depth, Intrinsics(**values), np.eye(4))
+
+
+def test_wrong_points(make):
+    good = two_busts()
+    detector = make()
+    for points, told in [
+        (good[:, :2], r"points: expected points of shape \(N, 3\), got \(1600, 2\)"),
+        (good[0], r"expected points of shape \(N, 3\), got \(3,\)"),
+        (good.tolist(), r"expected points of shape \(N, 3\), got list"),
+        (None, "got NoneType"),
+        (good.astype(np.float64), "expected C-contiguous float32 points, got float64"),
+        ((good * 1000).astype(np.int32), "float32 points, got int32"),
+        (good[::2], "expected C-contiguous float32"),
+        (np.asfortranarray(good), "expected C-contiguous float32"),
+        (np.empty((0, 3), np.float32), "points: the cloud is empty"),
+        (np.full((5, 3), np.nan, np.float32), "all 5 points are NaN or infinite"),
+        (np.full((5, 3), np.inf, np.float32), "all 5 points are NaN or infinite"),
+        ((good * 1000).astype(np.float32) + np.float32(2000), "are they in millimetres"),
+        (good + np.float32(9), r"none of 1600 points is within 0.7 m of \(0.00, 0.00, 0.00\)"),
+        (np.float32([[0.0, 0.0, 0.6]]), "between -0.5 m and 0.5 m high"),
+        (np.full((5, 3), 1e30, np.float32), "millimetres"),
+    ]:
+        with pytest.raises(HeadvoxError, match=told) as error:
+            detector.detect(points)
+        assert error.value.do
+
+
+def test_wrong_depth_images(make):
+    detector = make()
+    full = np.full((2, 3), 500, np.uint16)
+    for image, told in [
+        (
+            depth_image(full.astype(np.float32)),
+            r"left: expected a \(height, width\) uint16 depth image, got float32",
+        ),
+        (depth_image(full.astype(">u2")), "expected a .* uint16 depth image"),
+        (depth_image(full[None]), "uint16 depth image"),
+        (depth_image(full.tolist()), "uint16 depth image, got list"),
+        (depth_image(full, width=4), "left: the image is 3x2, its camera 4x2"),
+        (depth_image(full, height=3), "the image is 3x2, its camera 3x3"),
+        (depth_image(np.empty((0, 3), np.uint16)), "the image is 3x0"),
+        (depth_image(full, fx=0.0), "fx, fy and depth_scale must be above 0"),
+        (depth_image(full, fy=float("nan")), "fx, fy and depth_scale"),
+        (depth_image(full, depth_scale=-0.001), "fx, fy and depth_scale"),
+        (depth_image(np.zeros((2, 3), np.uint16)), "left: the depth image has no return at all"),
+        (depth_image(np.full((2, 3), 65535, np.uint16)), "left: no return is within 0.7 m"),
+    ]:
+        with pytest.raises(HeadvoxError, match=told) as error:
+            detector.detect_depth(image)
+        assert error.value.do
+
+
+def test_wrong_transforms(make):
+    detector = make()
+    full = np.full((2, 3), 500, np.uint16)
+    for T, told in [
+        (np.eye(3), r"expected a 4x4 matrix, got shape \(3, 3\)"),
+        (np.full((4, 4), np.nan), "NaN"),
+        (2 * np.eye(4), "the last row"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "not a rotation"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "not a rotation"),
+    ]:
+        with pytest.raises(HeadvoxError, match=told):
+            detector.detect(two_busts(), T)
+        with pytest.raises(HeadvoxError, match=told):
+            detector.detect_depth(replace(depth_image(full), T_world_camera=T))
+        with pytest.raises(HeadvoxError, match=told):
+            detector.detect_frame(Frame(0, clouds=(Cloud("c", two_busts(), T),)))
+
+
+def test_no_sensor_at_all(make):
+    with pytest.raises(HeadvoxError, match="neither points nor depth images"):
+        make().detect_frame(Frame(0))
+    with pytest.raises(HeadvoxError, match="neither points nor depth images"):
+        make().detect_depth([])
+
+
+def test_an_unknown_cascade_is_told_when_the_detector_is_made():
+    with pytest.raises(HeadvoxError, match="Unknown cascade 'hats'"):
+        Detector(DetectorConfig(cascade="hats"))
+
+
+def test_a_region_that_no_grid_can_hold_is_refused(make):
+    with pytest.raises(HeadvoxError, match=r"voxels of 0\.005 m"):
+        make(max_range_m=50.0, voxel_m=0.005).detect(two_busts())
+
+
+def test_cameras_out_of_sight_of_each_other(make):
+    """One camera without any return does not stop the other."""
+    frame = camera_frame(1, 2)
+    blind = replace(frame.depths[1], depth=np.zeros_like(frame.depths[1].depth))
+    alone = make(min_score=-2.0).detect_frame(Frame(0, depths=frame.depths[:1]))
+    both = make(min_score=-2.0).detect_frame(Frame(0, depths=(frame.depths[0], blind)))
+    assert both.scores.tolist() == alone.scores.tolist()
+
+
+def test_stage_times_are_told(make):
+    detector = make()
+    detector.detect(two_busts())
+    assert list(detector.stage_ms) == ["voxelize", "integral", "gate", "vote", "suppress", "judge", "refine"]
+    assert all(isinstance(ms, float) and ms >= 0 for ms in detector.stage_ms.values())
+
+
+def test_data_classes_iterate_and_compare():
+    heads = Heads(np.zeros((2, 3)), np.zeros((2, 4)), np.array([0.1, 0.2]), np.array([2.0, 1.0]))
+    assert len(heads) == 2
+    assert [(head.radius, head.score) for head in heads] == [(0.1, 2.0), (0.2, 1.0)]
+    assert BadFrame(3, "torn").reason == "torn"
+
+
+def test_a_cascade_of_the_tests_is_a_cascade():
+    assert parse_cascade(scenes.STAGES, "x").sees
+    assert not parse_cascade(scenes.VOTES, "x").sees

@@ -1,0 +1,74 @@
+"""How the command ends when it is interrupted, and when what it prints cannot be written."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from command import COMMAND, parse
+from inputs import write_recording
+
+
+def heed_ctrl_c() -> None:
+    """Undo what a shell does to its background jobs, should the tests be one."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def test_ctrl_c_ends_with_130_and_whole_lines(tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "long", 20_000)
+    command = [str(COMMAND), "run", str(folder), "--json", "-o", str(tmp_path / "out.jsonl")]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heed_ctrl_c,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        first = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+        errors = process.stderr.read()
+    assert process.returncode == 130
+    assert errors == ""
+    written = (tmp_path / "out.jsonl").read_text()
+    assert written.endswith("\n")
+    assert written.startswith(first + rest)
+    assert all(parse(line) for line in written.splitlines())
+
+
+def test_a_closed_pipe_ends_quietly(recording: Path) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    for arguments in (
+        ["run", str(recording), "--json"],
+        ["info", str(recording)],
+        ["masks", "list"],
+        ["--help"],
+    ):
+        done = subprocess.run(
+            [str(COMMAND), *arguments], stdout=writing, stderr=subprocess.PIPE, check=False, timeout=300
+        )
+        assert done.returncode == 0
+        assert done.stderr == b""
+    os.close(writing)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_explained(recording: Path) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [str(COMMAND), "run", str(recording), "--json"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert "No space left" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr

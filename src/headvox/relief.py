@@ -15,68 +15,85 @@ import numpy.typing as npt
 
 from headvox.data import F64, DepthImage, Expected, Heads
 from headvox.keep import keep
-from headvox.machine.kernels import kernel, read_only, rule
+from headvox.machine.kernels import bare_kernel, kernel, read_only
+from headvox.machine.simd import LANES
 from headvox.masks.compile import SCORE_UNIT, CompiledRelief
 from headvox.visibility import NEAREST_M, world_to_pixels
+from headvox.vote import order
 
 I16 = npt.NDArray[np.int16]
 I64 = npt.NDArray[np.int64]
 
 FARTHEST = 600  # mm: farther from the centre, either way, is as far
 UNKNOWN = 601  # no return, or out of view
-STEP_M = 0.01  # of the 3x3 places whose median is a spot's
+NINE, STEP_M = 9, 0.01  # 3x3 places, as far from each other, whose median is a spot's
 ON_HEAD = 200  # mm: surface that may be the head's or the neck's
 STEEP = 1e-3  # sine of the angle between a ray and the vertical, from which on nothing is right or left
 
 
-@rule
-def median(values, count):  # type: ignore[no-untyped-def]
-    """Return the lower median of the first ``count`` of ``values``, which it sorts; UNKNOWN of none."""
-    for i in range(1, count):
-        value, k = values[i], i
-        while k > 0 and values[k - 1] > value:
-            values[k] = values[k - 1]
-            k -= 1
-        values[k] = value
-    return values[(count - 1) // 2] if count > 0 else UNKNOWN
+@bare_kernel
+def set_places(spots, places):  # type: ignore[no-untyped-def]
+    """Write the nine places about each spot to ``places`` (2, 9 W): metres to the right of the centre and above it.
 
-
-@rule
-def relief_at(depth, scale, u, v, far):  # type: ignore[no-untyped-def]
-    """Return how much farther than a place the surface is, along the camera's axis, in mm.
-
-    The place is at column ``u`` / ``far`` and row ``v`` / ``far``, ``far`` metres away.
+    There are nine rows of W; lane 2 k of each is for spot k of ``spots`` (K, 2), the next lane for the one on the left.
     """
-    if not far > NEAREST_M:
-        return UNKNOWN
-    column, row = int(np.floor(u / far + 0.5)), int(np.floor(v / far + 0.5))
-    if column < 0 or row < 0 or column >= depth.shape[1] or row >= depth.shape[0] or depth[row, column] == 0:
-        return UNKNOWN
-    beyond = np.floor(1000.0 * (depth[row, column] * scale - far) + 0.5)
-    return int(min(max(beyond, -FARTHEST), FARTHEST))
+    lanes = places.shape[1] // NINE
+    for i in range(3):
+        for j in range(3):
+            for lane in range(2 * spots.shape[0]):
+                k, at = lane // 2, (3 * i + j) * lanes + lane
+                side = -spots[k, 0] if lane & 1 else spots[k, 0]
+                places[0, at], places[1, at] = side + STEP_M * (i - 1), spots[k, 1] + STEP_M * (j - 1)
 
 
-@rule
-def spot_at(depth, scale, middle, right, up, a, b, around):  # type: ignore[no-untyped-def]
-    """Return the median of the 3x3 places about the spot ``a`` metres to the ``right`` and ``b`` metres ``up``.
+@bare_kernel
+def find_pixels(middle, right, up, places, width, height, pixels, far):  # type: ignore[no-untyped-def]
+    """Write the number of the pixel that sees each of ``places`` (2, P), -1 if none does, and how ``far`` it is (m).
 
     ``middle``, ``right`` and ``up`` (3,) are what the camera makes of the centre and of a metre either way.
     """
-    there = 0
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            s, t = a + STEP_M * i, b + STEP_M * j
-            value = relief_at(
-                depth,
-                scale,
-                middle[0] + s * right[0] + t * up[0],
-                middle[1] + s * right[1] + t * up[1],
-                middle[2] + s * right[2] + t * up[2],
-            )
-            if value != UNKNOWN:
-                around[there] = value
-                there += 1
-    return median(around, there)
+    # By itself, so that the compiler makes vectors of it: quotients are slow.
+    for p in range(np.uint64(places.shape[1])):
+        s, t = places[0, p], places[1, p]
+        z = middle[2] + s * right[2] + t * up[2]
+        column = np.floor((middle[0] + s * right[0] + t * up[0]) / z + 0.5)
+        row = np.floor((middle[1] + s * right[1] + t * up[1]) / z + 0.5)
+        seen = (z > NEAREST_M) & (column >= 0.0) & (row >= 0.0) & (column < width) & (row < height)
+        pixels[p] = np.int64(row * width + column) if seen else -1
+        far[p] = z
+
+
+@bare_kernel
+def read_pixels(flat, pixels, raw):  # type: ignore[no-untyped-def]
+    """Write what ``pixels`` measured to ``raw``: 0 where there is none, too."""
+    for p in range(np.uint64(pixels.shape[0])):
+        raw[p] = flat[np.uint64(pixels[p])] if pixels[p] >= 0 else np.uint16(0)
+
+
+@bare_kernel
+def compare(raw, scale, far, beyond):  # type: ignore[no-untyped-def]
+    """Write how much farther than a place the surface is, along the camera's axis, in mm; UNKNOWN without a return."""
+    for p in range(np.uint64(raw.shape[0])):
+        mm = np.floor(1000.0 * (raw[p] * scale - far[p]) + 0.5)
+        beyond[p] = np.int16(min(max(mm, -FARTHEST), FARTHEST)) if raw[p] != 0 else UNKNOWN
+
+
+@bare_kernel
+def take_medians(beyond, medians):  # type: ignore[no-untyped-def]
+    """Write the lower median of what is known in each lane of nine rows of ``beyond``; UNKNOWN of none.
+
+    The rows are brought in order.
+    """
+    lanes = medians.shape[0]
+    for turn in range(NINE):  # neighbours change places until no lane needs it: what is not known comes last
+        for row in range(turn & 1, NINE - 1, 2):
+            for lane in range(row * lanes, (row + 1) * lanes, LANES):
+                order(beyond, lane, lane + lanes)
+    for lane in range(lanes):
+        known = 0
+        for row in range(NINE):
+            known += beyond[row * lanes + lane] != UNKNOWN
+        medians[lane] = beyond[max(known - 1, 0) // 2 * lanes + lane]
 
 
 @kernel
@@ -87,15 +104,19 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):  #
     is (3, 4): rows that give u·Z, v·Z and Z of a world point; ``origin`` (3,) is where it stands.
     """
     count = spots.shape[0]
-    around, mine = np.empty(9, np.int64), np.empty(2 * count, np.int64)
+    lanes = -(-2 * count // LANES) * LANES
+    places, far, pixels = np.zeros((2, NINE * lanes)), np.empty(NINE * lanes), np.empty(NINE * lanes, np.int64)
+    raw, beyond = np.empty(NINE * lanes, np.uint16), np.empty(NINE * lanes, np.int16)
+    medians = np.empty(lanes, np.int16)
     middle, right, up = np.empty(3), np.empty(3), np.empty(3)
+    set_places(spots, places)
     for i in range(centres.shape[0]):
         x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
         dx, dy, dz = x - origin[0], y - origin[1], z - origin[2]
         flat = np.sqrt(dx * dx + dy * dy)
         away = np.sqrt(flat * flat + dz * dz)
-        if away < NEAREST_M:
-            continue
+        if away < NEAREST_M or not 2 * count / away > best[i]:
+            continue  # or another camera sees more of it than this one can
         rx, ry = 1.0, 0.0
         if flat > STEEP * away:
             rx, ry = dy / flat, -dx / flat
@@ -104,21 +125,22 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):  #
             middle[k] = camera[k, 0] * x + camera[k, 1] * y + camera[k, 2] * z + camera[k, 3]
             right[k] = camera[k, 0] * rx + camera[k, 1] * ry
             up[k] = camera[k, 0] * ux + camera[k, 1] * uy + camera[k, 2] * uz
+        find_pixels(middle, right, up, places, depth.shape[1], depth.shape[0], pixels, far)
+        read_pixels(depth.reshape(-1), pixels, raw)
+        compare(raw, scale, far, beyond)
+        take_medians(beyond, medians)
         on = 0
+        for lane in range(2 * count):
+            on += abs(medians[lane]) <= ON_HEAD
+        if not on / away > best[i]:
+            continue
+        best[i] = on / away
         for k in range(count):
-            if not (on + 2 * (count - k)) / away > best[i]:
-                break  # another camera sees more of it than this one can
-            one = spot_at(depth, scale, middle, right, up, spots[k, 0], spots[k, 1], around)
-            other = spot_at(depth, scale, middle, right, up, -spots[k, 0], spots[k, 1], around)
-            on += (abs(one) <= ON_HEAD) + (abs(other) <= ON_HEAD)
+            one, other = medians[2 * k], medians[2 * k + 1]
             one, other = other if one == UNKNOWN else one, one if other == UNKNOWN else other
             # What is not known on either side is neither free space nor in front.
             one, other = one if one != UNKNOWN else 0, other if other != UNKNOWN else 0
-            mine[2 * k], mine[2 * k + 1] = min(one, other), max(one, other)
-        if on / away > best[i]:
-            best[i] = on / away
-            for k in range(2 * count):
-                relief[i, k] = mine[k]
+            relief[i, 2 * k], relief[i, 2 * k + 1] = min(one, other), max(one, other)
 
 
 @kernel

@@ -18,7 +18,7 @@ from headvox.masks.compile import CompiledCascade, CompiledStages
 from headvox.pose.fit import FitMemory
 from headvox.refine import MOST_PARTS, ROWS
 from headvox.slabs import Slabs, cut
-from headvox.visibility import cells_of
+from headvox.visibility import as_columns, cells_of
 from headvox.vote import StageTables, seen_boxes
 from headvox.voxelize import Lattice, Marking
 
@@ -143,6 +143,6 @@ class Stages:
         stages = StageTables.of(compiled, sum_type)
         boxes, _ = seen_boxes(compiled)
         memory = [stages.memory() for _ in range(threads)]
-        return cls(
-            compiled, stages.tables, memory, np.empty((len(compiled.boxes), 8), np.int64), *cells_of(boxes)
-        )
+        offsets, start = cells_of(boxes)
+        corners = np.empty((len(compiled.boxes), 8), np.int64)
+        return cls(compiled, stages.tables, memory, corners, as_columns(offsets), start)

@@ -343,7 +343,7 @@ class Detector:
         self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory
     ) -> I64:
         """Return the scores of all stages of the judge, with what the cameras saw empty and hidden."""
-        states = np.zeros((len(cells), len(judge.offsets)), np.uint8)
+        states = np.zeros((len(cells), judge.offsets.shape[1]), np.uint8)
         in_lattice = cells + memory.first.astype(np.int32)
         seen = np.empty((len(cells), len(judge.offset_start) - 1, 2), np.int32)
         views = [self._placing.view(image, memory.lattice) for image in frame.depths]

@@ -18,7 +18,7 @@ from headvox.keep import keep
 from headvox.machine.kernels import bare_kernel, kernel, read_only
 from headvox.machine.simd import LANES
 from headvox.masks.compile import SCORE_UNIT, CompiledRelief
-from headvox.visibility import NEAREST_M, world_to_pixels
+from headvox.visibility import NEAREST_M, read_pixels, world_to_pixels
 from headvox.vote import order
 
 I16 = npt.NDArray[np.int16]
@@ -59,15 +59,8 @@ def find_pixels(middle, right, up, places, width, height, pixels, far):  # type:
         column = np.floor((middle[0] + s * right[0] + t * up[0]) / z + 0.5)
         row = np.floor((middle[1] + s * right[1] + t * up[1]) / z + 0.5)
         seen = (z > NEAREST_M) & (column >= 0.0) & (row >= 0.0) & (column < width) & (row < height)
-        pixels[p] = np.int64(row * width + column) if seen else -1
+        pixels[p] = np.int32(row * width + column) if seen else np.int32(-1)
         far[p] = z
-
-
-@bare_kernel
-def read_pixels(flat, pixels, raw):  # type: ignore[no-untyped-def]
-    """Write what ``pixels`` measured to ``raw``: 0 where there is none, too."""
-    for p in range(np.uint64(pixels.shape[0])):
-        raw[p] = flat[np.uint64(pixels[p])] if pixels[p] >= 0 else np.uint16(0)
 
 
 @bare_kernel
@@ -105,7 +98,11 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):  #
     """
     count = spots.shape[0]
     lanes = -(-2 * count // LANES) * LANES
-    places, far, pixels = np.zeros((2, NINE * lanes)), np.empty(NINE * lanes), np.empty(NINE * lanes, np.int64)
+    places, far, pixels = (
+        np.zeros((2, NINE * lanes)),
+        np.empty(NINE * lanes),
+        np.empty(NINE * lanes, np.int32),
+    )
     raw, beyond = np.empty(NINE * lanes, np.uint16), np.empty(NINE * lanes, np.int16)
     medians = np.empty(lanes, np.int16)
     middle, right, up = np.empty(3), np.empty(3), np.empty(3)

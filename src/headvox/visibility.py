@@ -70,29 +70,42 @@ def state_at(raw, camera, far):  # type: ignore[no-untyped-def]
     return (EMPTY * is_empty + HIDDEN * is_hidden) * (raw != 0)
 
 
-@rule
-def look(depth, camera, x, y, z):  # type: ignore[no-untyped-def]
-    """Return EMPTY, HIDDEN or 0 for the centre of the cell x, y, z, as this camera saw it."""
-    column, row, far = pixel_of(camera, x, y, z)
-    if column < 0 or row < 0 or column >= depth.shape[1] or row >= depth.shape[0]:
-        return 0
-    return state_at(depth[row, column], camera, far)
+@kernel
+def look_about(depth, camera, cells, offsets, states):  # type: ignore[no-untyped-def]
+    """Merge what one camera saw of the cells about each candidate into ``states`` (candidates, M).
+
+    ``offsets`` (3, M) lead from a candidate to its cells.
+    """
+    count = offsets.shape[1]
+    pixels, far, raw = np.empty(count, np.int32), np.empty(count, np.float32), np.empty(count, np.uint16)
+    for i in range(cells.shape[0]):
+        _find_pixels(camera, depth.shape[1], depth.shape[0], cells[i], offsets, pixels, far)
+        read_pixels(depth.reshape(-1), pixels, raw)
+        _merge(raw, camera, far, states[i])
 
 
 @bare_kernel
-def look_about(depth, camera, cells, offsets, states):  # type: ignore[no-untyped-def]
-    """Merge what one camera saw of the cells about each candidate into ``states`` (candidates, offsets)."""
-    for i in range(cells.shape[0]):
-        for k in range(offsets.shape[0]):
-            if states[i, k] != EMPTY:
-                state = look(
-                    depth,
-                    camera,
-                    np.float32(cells[i, 0] + offsets[k, 0]),
-                    np.float32(cells[i, 1] + offsets[k, 1]),
-                    np.float32(cells[i, 2] + offsets[k, 2]),
-                )
-                states[i, k] = max(states[i, k], state)
+def _find_pixels(camera, width, height, cell, offsets, pixels, far):  # type: ignore[no-untyped-def]
+    """Write the number of the pixel that sees each of the cells about ``cell``, -1 if none, and how far it is (m)."""
+    # By itself, as the other steps, so that the compiler makes vectors of it.
+    for k in range(np.uint64(offsets.shape[1])):
+        x, y, z = cell[0] + offsets[0, k], cell[1] + offsets[1, k], cell[2] + offsets[2, k]
+        column, row, far[k] = pixel_of(camera, np.float32(x), np.float32(y), np.float32(z))
+        seen = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        pixels[k] = np.int32(row * width + column) if seen else np.int32(-1)
+
+
+@bare_kernel
+def read_pixels(flat, pixels, raw):  # type: ignore[no-untyped-def]
+    """Write what ``pixels`` of a flat image measured to ``raw``; 0 for a negative number, which is no pixel."""
+    for k in range(np.uint64(pixels.shape[0])):
+        raw[k] = flat[np.uint64(pixels[k])] if pixels[k] >= 0 else np.uint16(0)
+
+
+@bare_kernel
+def _merge(raw, camera, far, states):  # type: ignore[no-untyped-def]
+    for k in range(np.uint64(raw.shape[0])):
+        states[k] = max(states[k], np.uint8(state_at(raw[k], camera, far[k])))
 
 
 @kernel
@@ -187,7 +200,7 @@ def _world_to_pixels(lens: Intrinsics, place: bytes) -> tuple[F64, F64]:
 
 
 def camera_table(image: DepthImage, lattice: Lattice) -> F32:
-    """Return ``image``'s camera as :func:`look` reads it."""
+    """Return ``image``'s camera as :func:`look_about` reads it."""
     K = projection(image.intrinsics)
     T = inverse(image.T_world_camera)
     first = np.array(lattice.origin) + 0.5 * lattice.voxel_m  # the centre of cell 0, 0, 0
@@ -208,6 +221,11 @@ def cells_of(boxes: I32) -> tuple[I32, I32]:
     return np.array(cells, np.int32).reshape(-1, 3), np.array(start, np.int32)
 
 
+def as_columns(offsets: I32) -> I32:
+    """Return ``offsets`` (M, 3) as :func:`look_about` reads them: (3, M)."""
+    return np.ascontiguousarray(offsets.T)
+
+
 def count_seen(images: tuple[DepthImage, ...], lattice: Lattice, cells: I32, boxes: I32) -> I32:
     """Return how many cells of each box about each candidate are known-empty and hidden.
 
@@ -217,7 +235,7 @@ def count_seen(images: tuple[DepthImage, ...], lattice: Lattice, cells: I32, box
     offsets, start = cells_of(boxes)
     states = np.zeros((len(cells), len(offsets)), np.uint8)
     for image in images:
-        look_about(read_only(image.depth), camera_table(image, lattice), cells, offsets, states)
+        look_about(read_only(image.depth), camera_table(image, lattice), cells, as_columns(offsets), states)
     seen = np.empty((len(cells), len(boxes), 2), np.int32)
     count_states(states, start, seen)
     return seen

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 import pytest
 import scenes
+from busts import camera_frame
 from gpu_arrays import (
     METRES,
     REGION,
@@ -18,7 +19,6 @@ from gpu_arrays import (
     words_for,
 )
 from numba import cuda
-from test_pipeline import camera_frame
 
 from headvox import Cloud, Frame, assemble
 from headvox.cuda import fits as fits_module

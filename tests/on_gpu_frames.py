@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scenes
+from busts import NARROW, SMALL, camera_frame, two_busts
 from gpu_arrays import (
     METRES,
     RADIANS,
@@ -17,7 +18,6 @@ from gpu_arrays import (
     use_few_turns,
 )
 from numba import cuda
-from test_pipeline import NARROW, SMALL, camera_frame, two_busts
 
 from headvox import Cloud, Detector, Frame, HeadvoxError, Intrinsics
 from headvox.cli import main

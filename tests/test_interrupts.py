@@ -1,10 +1,19 @@
 import ctypes
+import signal
 import sys
 import time
 
 import pytest
 
 from headvox.machine.interrupts import AGAIN_S, heeded
+
+
+@pytest.fixture(autouse=True)
+def _in_the_foreground():
+    """Undo what a shell does to its background jobs, should the tests be one: they ignore interrupts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 class Finalized:

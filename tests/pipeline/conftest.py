@@ -1,16 +1,9 @@
 import pytest
 import scenes
+from busts import SMALL
 
 from headvox import Detector
 from headvox.config import DetectorConfig
-
-SMALL = {
-    "max_range_m": 0.7,
-    "min_height_m": -0.5,
-    "max_height_m": 0.5,
-    "centre": (0.0, 0.0, 0.0),
-    "refine": "sphere",
-}
 
 
 @pytest.fixture(scope="session")

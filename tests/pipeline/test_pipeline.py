@@ -6,7 +6,7 @@ import naive
 import numpy as np
 import pytest
 import scenes
-from busts import camera_frame, everything, two_busts
+from busts import NARROW, camera_frame, everything, two_busts
 
 from headvox import Cloud, Frame, Heads
 from headvox.data import Expected
@@ -20,7 +20,6 @@ def same_heads(heads: Heads, wanted: naive.Found):
     np.testing.assert_allclose(heads.radii, wanted.radii, atol=1e-9)
 
 
-NARROW = {"max_range_m": 0.45, "min_height_m": -0.25, "max_height_m": 0.35}
 REGION = Region((0.0, 0.0, 0.0), 0.45, -0.25, 0.35)
 
 

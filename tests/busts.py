@@ -1,9 +1,18 @@
-"""What the detectors of these tests look at, and the bytes of what they find."""
+"""Two heads on shoulders as detectors of small regions see them, and the bytes of what these find."""
 
 import numpy as np
 import scenes
 
 from headvox import Frame, Heads
+
+SMALL = {
+    "max_range_m": 0.7,
+    "min_height_m": -0.5,
+    "max_height_m": 0.5,
+    "centre": (0.0, 0.0, 0.0),
+    "refine": "sphere",
+}
+NARROW = {"max_range_m": 0.45, "min_height_m": -0.25, "max_height_m": 0.35}
 
 
 def everything(heads: Heads) -> tuple[bytes, ...]:

@@ -163,11 +163,15 @@ def test_where_a_head_is_expected_less_is_enough(tmp_path, sample):
     steps = np.rint(heads.scores * 1024).astype(int)
     expected = Expected(heads.centres[-1:], np.full((1, 4), np.nan), np.array([0.05]))
     common = (sample.depths, relief, int(steps[-1]) + 100)
-    kept, which = look_again(heads, *common, 200, expected, 0.05)
+    peaks = (heads.centres, steps)
+    which, scores = look_again(*peaks, *common, 200, expected, 0.05)
     assert which.tolist() == [*np.flatnonzero(steps >= steps[-1] + 100), len(heads) - 1]
-    assert kept.sure.tolist() == [True] * (len(kept) - 1) + [False]
-    _, without = look_again(heads, *common, 200, None, 0.05)
+    assert scores.tolist() == steps[which].tolist()
+    without, _ = look_again(*peaks, *common, 200, None, 0.05)
     assert len(heads) - 1 not in without
+    again = with_relief(tmp_path, 0.0, float(steps[-1] + 100) / 1024).detect_frame(sample, expected)
+    np.testing.assert_array_equal(again.scores, heads.scores[which])
+    assert again.sure.tolist() == [True] * (len(which) - 1) + [False]
 
 
 @pytest.mark.parametrize(

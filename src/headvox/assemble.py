@@ -19,13 +19,11 @@ MOST_POSES = 32
 RADIUS_M = 0.1  # of a head to which no sphere was fitted
 
 
-def heads_at(
-    centres: F64, scores: I64, least: int, spheres: F64 | None, haired: bool, yaws: F64 | None
-) -> Heads:
-    """Return the heads at voxels whose ``centres`` are (N, 3) metres, world, and whose ``scores`` (N,) are in steps.
+def best_apart(centres: F64, scores: I64, spheres: F64 | None, haired: bool) -> tuple[I64, F64, F64]:
+    """Return which of the peaks at voxels with these ``centres`` (N, 3) are heads of their own, best score first.
 
-    ``spheres`` (N, 6) were fitted about the voxels (:func:`headvox.refine.fit_spheres`); ``haired`` says that they lie
-    on hair, not on the skull. ``yaws`` (N,) are in radians, if known. Heads that score ``least`` are sure.
+    Also returned are where their centres are and their radii, metres, world. ``spheres`` (N, 6) were fitted about the
+    voxels (:func:`headvox.refine.fit_spheres`); ``haired`` says that they lie on hair, not on the skull.
     """
     if spheres is None:
         radii: F64 = np.full(len(centres), RADIUS_M)
@@ -34,11 +32,14 @@ def heads_at(
         if haired:
             centres[:, 2] -= HAIR_M
     kept = suppress_overlaps(centres, scores, SAME_HEAD_M)
-    return stated(centres[kept], radii[kept], scores[kept], least, None if yaws is None else yaws[kept])
+    return kept, centres[kept], radii[kept]
 
 
 def stated(centres: F64, radii: F64, scores: I64, least: int, yaws: F64 | None) -> Heads:
-    """Return heads of which this is known: see :func:`heads_at`."""
+    """Return heads with these ``centres`` (N, 3) and ``radii`` (N,), metres, world, best score first.
+
+    ``scores`` (N,) are in steps; heads that score ``least`` are sure. ``yaws`` (N,) are in radians, if known.
+    """
     if yaws is None:
         quaternions = unknown(len(centres), 4)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,21 @@ from headvox.masks.cascade import Cascade
 from headvox.masks.compile import SCORE_UNIT, CompiledRelief
 
 I64 = npt.NDArray[np.int64]
+
+
+class Judged(NamedTuple):
+    """What the judge lets through: N voxels that are heads, or may yet turn out to be some."""
+
+    cells: npt.NDArray[np.int32]
+    """(N, 3), of the integral volume"""
+    centres: F64
+    """(N, 3) metres, world"""
+    scores: I64
+    """(N,) in steps"""
+    peaks: I64
+    """(N,) which of the candidates each was found at"""
+    least: int
+    """What a head has to score, in steps."""
 
 
 def asks_cameras(frame: Frame, sees: bool) -> bool:

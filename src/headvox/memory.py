@@ -136,6 +136,10 @@ class Stages:
     corners: I64
     offsets: I32
     offset_start: I32
+    occupied: tuple[int, int]
+    """The stages that do without the cameras, from the first to the second,"""
+    seeing: tuple[int, int]
+    """and all further ones."""
 
     @classmethod
     def of(cls, compiled: CompiledStages, sum_type: np.dtype[Any], threads: int) -> Stages:
@@ -145,4 +149,6 @@ class Stages:
         memory = [stages.memory() for _ in range(threads)]
         offsets, start = cells_of(boxes)
         corners = np.empty((len(compiled.boxes), 8), np.int64)
-        return cls(compiled, stages.tables, memory, corners, as_columns(offsets), start)
+        first, all_stages = compiled.occupied_stages, len(compiled.stage_keep)
+        spans = (0, first), (first, all_stages)
+        return cls(compiled, stages.tables, memory, corners, as_columns(offsets), start, *spans)

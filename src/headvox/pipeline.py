@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.assemble import MOST_POSES, heads_at, with_poses
+from headvox.assemble import MOST_POSES, best_apart, stated, with_poses
 from headvox.check import check_frame, knows_an_origin, nothing_in_range
 from headvox.config import DetectorConfig
 from headvox.cuda.detect import DEVICE_STAGES, OnDevice
@@ -20,7 +20,7 @@ from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners
-from headvox.keep import asks_cameras, keep, least_before, least_score, slack_of
+from headvox.keep import Judged, asks_cameras, keep, least_before, least_score, slack_of
 from headvox.machine.clock import Clock
 from headvox.machine.kernels import read_only
 from headvox.machine.threads import Threads, new_blocks
@@ -136,9 +136,9 @@ class Detector:
             self._looked_at = (memory, survivors, scores)
             peaks = self._suppress(S, survivors, scores, memory)
             clock.done("suppress")
-            cells, scores, peaks, least = self._judge(frame, S, survivors, scores, peaks, memory, expected)
+            judged = self._judge(frame, S, survivors, scores, peaks, memory, expected)
             clock.done("judge")
-            heads = self._refine(frame, cells, scores, peaks, least, memory, expected)
+            heads = self._refine(frame, judged, memory, expected)
             clock.done("refine")
             return heads
 
@@ -265,7 +265,9 @@ class Detector:
         scores = memory.scores[: len(survivors)]
         votes = self.cascade.votes
         if memory.search is not None:
-            self._score(S, survivors, memory.unseen, memory.search, memory, scores)
+            search = memory.search
+            set_corners(S, search.compiled.boxes, search.corners)
+            self._score(S, survivors, memory.unseen, search, search.occupied, memory, scores)
         elif votes is not None:
             table = (votes.boxes, votes.weights, votes.start, votes.masks, votes.pairs)
 
@@ -277,15 +279,11 @@ class Detector:
         return scores
 
     def _score(
-        self, S: npt.NDArray[Any], cells: I32, seen: I32, stages: Stages, memory: Memory, scores: I64,
-        all_stages: bool = False,
+        self, S: npt.NDArray[Any], cells: I32, seen: I32, stages: Stages, span: tuple[int, int], memory: Memory,
+        scores: I64,
     ) -> None:  # fmt: skip
-        """Write the score of each of ``cells`` by ``stages``; by those that ask nothing of the cameras, if not all."""
-        compiled = stages.compiled
-        last = len(compiled.stage_keep) if all_stages else compiled.occupied_stages
-        set_corners(S, compiled.boxes, stages.corners)
-
-        common = (last, *stages.tables, stages.corners, memory.alive)
+        """Write the score of each of ``cells`` by some of the ``stages``: from the first to the second of ``span``."""
+        common = (*span, *stages.tables, stages.corners, memory.alive)
         calls = [
             (S, *memory.slabs[1:], cells, seen, low, high, *common, *stages.memory[part], scores)
             for part, low, high in shares_of(len(cells), 1 if len(cells) < FEW else self._threads.count)
@@ -308,23 +306,20 @@ class Detector:
     def _judge(
         self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: Memory,
         expected: Expected | None,
-    ) -> tuple[I32, I64, I64, int]:  # fmt: skip
-        """Look closer at the peaks, and let those through that reach the cascade's threshold, or still may.
-
-        Returned are their cells, their scores, which of the peaks they were, and the threshold, in steps of the score.
-        """
+    ) -> Judged:  # fmt: skip
+        """Look closer at the peaks, and let those through that reach the cascade's threshold, or still may."""
         cells, scores, judge = survivors[peaks], scores[peaks], memory.judge
         sees = asks_cameras(frame, memory.sees)
         if judge is not None and len(cells):
             cells, scores, found = self._best_about(S, cells, judge, memory)
             peaks = peaks[found]
             if sees and len(cells):
-                scores = self._look_about(frame, S, cells, judge, memory)
+                self._look_about(frame, S, cells, judge, memory, scores)
         least = least_score(self.config, self.cascade.source, blind=memory.sees and not sees)
         centres, slack = memory.centres(cells), slack_of(self.config, expected)
         hopeful = least_before(least, self.cascade.relief, sees)
-        kept = keep(centres, scores, hopeful, slack, expected, memory.lattice.voxel_m)
-        return cells[kept], scores[kept], peaks[kept], least
+        kept = np.flatnonzero(keep(centres, scores, hopeful, slack, expected, memory.lattice.voxel_m))
+        return Judged(cells[kept], centres[kept], scores[kept], peaks[kept], least)
 
     def _best_about(
         self, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory
@@ -333,23 +328,22 @@ class Detector:
         around = AROUND[self.cascade.gate.spacing]
         about = (cells[:, None] + around).reshape(-1, 3)
         memory.make_room(len(about))
-        scores = np.empty(len(about), np.int64)
-        self._score(S, about, memory.unseen, judge, memory, scores)
-        best = np.empty(len(cells), np.int64)
+        scores, best = np.empty((2, len(about)), np.int64)
+        set_corners(S, judge.compiled.boxes, judge.corners)
+        self._score(S, about, memory.unseen, judge, judge.occupied, memory, scores)
         best = best[: best_of_each(about, scores, len(around), DROPPED + 1, best)]
         return about[best], scores[best], best // len(around)
 
     def _look_about(
-        self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory
-    ) -> I64:
-        """Return the scores of all stages of the judge, with what the cameras saw empty and hidden."""
+        self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory, scores: I64
+    ) -> None:
+        """Go on to score by the stages of the judge that ask what the cameras saw empty and hidden."""
         states = np.zeros((len(cells), judge.offsets.shape[1]), np.uint8)
         in_lattice = cells + memory.first.astype(np.int32)
         seen = np.empty((len(cells), len(judge.offset_start) - 1, 2), np.int32)
-        views = [self._placing.view(image, memory.lattice) for image in frame.depths]
-
         cameras = [
-            (read_only(image.depth), table) for image, (_, table) in zip(frame.depths, views, strict=True)
+            (read_only(image.depth), self._placing.view(image, memory.lattice).table)
+            for image in frame.depths
         ]
 
         def look(cells: I32, states: npt.NDArray[np.uint8], seen: I32) -> None:
@@ -360,30 +354,23 @@ class Detector:
         shares = shares_of(len(cells), 1 if len(cells) < FEW_PEAKS else self._threads.count)
         calls = [(in_lattice[low:high], states[low:high], seen[low:high]) for _, low, high in shares]
         self._threads.run(look, calls)
-        scores = np.empty(len(cells), np.int64)
-        self._score(S, cells, seen, judge, memory, scores, all_stages=True)
-        return scores
+        self._score(S, cells, seen, judge, judge.seeing, memory, scores)
 
-    def _refine(
-        self,
-        frame: Frame,
-        cells: I32,
-        scores: I64,
-        peaks: I64,
-        least: int,
-        memory: Memory,
-        expected: Expected | None,
-    ) -> Heads:
+    def _refine(self, frame: Frame, judged: Judged, memory: Memory, expected: Expected | None) -> Heads:
+        """Fit spheres, take the best of those that overlap, look again pixel by pixel, and fit poses."""
+        cells, centres, scores, peaks, least = judged
         if len(cells) == 0:
             return Heads()
         spheres = None if self.config.refine == "none" else self._fit_spheres(cells, memory)
-        votes = self.cascade.votes
-        yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks]]
-        haired = knows_an_origin(frame)
-        heads = heads_at(memory.centres(cells), scores, least, spheres, haired, yaws)
-        relief, slack = self.cascade.relief, slack_of(self.config, expected)
+        kept, centres, radii = best_apart(centres, scores, spheres, haired=knows_an_origin(frame))
+        scores, relief = scores[kept], self.cascade.relief
         if relief is not None and asks_cameras(frame, memory.sees):
-            heads, _ = look_again(heads, frame.depths, relief, least, slack, expected, memory.lattice.voxel_m)
+            limits = (least, slack_of(self.config, expected), expected, memory.lattice.voxel_m)
+            again, scores = look_again(centres, scores, frame.depths, relief, *limits)
+            kept, centres, radii = kept[again], centres[again], radii[again]
+        votes = self.cascade.votes
+        yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks[kept]]]
+        heads = stated(centres, radii, scores, least, yaws)
         if self.config.refine != "pose":
             return heads
         best = heads.centres[:MOST_POSES]

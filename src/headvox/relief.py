@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64, DepthImage, Expected, Heads
+from headvox.data import F64, DepthImage, Expected
 from headvox.keep import keep
 from headvox.machine.kernels import bare_kernel, kernel, read_only
 from headvox.machine.simd import LANES
-from headvox.masks.compile import SCORE_UNIT, CompiledRelief
+from headvox.masks.compile import CompiledRelief
 from headvox.visibility import NEAREST_M, read_pixels, world_to_pixels
 from headvox.vote import order
 
@@ -176,19 +176,15 @@ def gains_of(images: Sequence[DepthImage], centres: F64, relief: CompiledRelief)
 
 
 def look_again(
-    heads: Heads, images: Sequence[DepthImage], relief: CompiledRelief, least: int, slack: int,
+    centres: F64, scores: I64, images: Sequence[DepthImage], relief: CompiledRelief, least: int, slack: int,
     expected: Expected | None, voxel_m: float,
-) -> tuple[Heads, I64]:  # fmt: skip
-    """Return those of ``heads``, best first, whose score is enough after the last look, and which of them they are.
+) -> tuple[I64, I64]:  # fmt: skip
+    """Return which of the peaks at ``centres`` (N, 3), world, are heads after the last look, best first, and what they
+    score then.
 
-    ``heads`` have no pose yet. For the other numbers, in steps, see :func:`headvox.keep.keep`.
+    For the numbers in steps see :func:`headvox.keep.keep`.
     """
-    gains = gains_of(images, heads.centres, relief)
-    scores = np.rint(heads.scores * SCORE_UNIT).astype(np.int64) + gains
-    kept = np.flatnonzero(keep(heads.centres, scores, least, slack, expected, voxel_m))
+    scores = scores + gains_of(images, centres, relief)
+    kept = np.flatnonzero(keep(centres, scores, least, slack, expected, voxel_m))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
-    told = Heads(
-        heads.centres[kept], heads.quaternions[kept], heads.radii[kept], scores[kept] / SCORE_UNIT,
-        sure=scores[kept] >= least,
-    )  # fmt: skip
-    return told, kept
+    return kept, scores[kept]

@@ -198,11 +198,13 @@ def _look_up(flat, at, is_odd, width, corners, first, count, sums):  # type: ign
 
 @bare_kernel
 def vote_stages(  # type: ignore[no-untyped-def]
-    S, seams, overlap, cells, seen, first, last, to_stage, group_start, group_channel, seen_start, used_start, used,
-    leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, is_odd, sums, features,
-    values, total, scores,
+    S, seams, overlap, cells, seen, first, last, from_stage, to_stage, group_start, group_channel, seen_start,
+    used_start, used, leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, is_odd,
+    sums, features, values, total, scores,
 ):  # fmt: skip
-    """Write the sum of the trees of the first ``to_stage`` stages to ``scores``; DROPPED where a stage says so.
+    """Write the sum of the trees of the stages before ``to_stage`` to ``scores``; DROPPED where a stage says so.
+
+    With a ``from_stage`` above 0, ``scores`` has the sum of those before it, and none that was dropped.
 
     Each stage takes the candidates that are left, LANES at a time: it looks up the groups its trees ask for, and adds
     its trees up. ``seen`` (candidates, boxes of other channels, 2) holds how many cells of a box are known-empty and
@@ -212,9 +214,10 @@ def vote_stages(  # type: ignore[no-untyped-def]
     """
     flat, end, slices = S.reshape(-1), last, overlap * S.shape[1] * S.shape[2]
     for i in range(first, last):
-        scores[i] = 0
+        if from_stage == 0:
+            scores[i] = 0
         alive[i] = i
-    for s in range(to_stage):
+    for s in range(from_stage, to_stage):
         kept = first
         for begin in range(first, end, LANES):
             width = min(LANES, end - begin)
@@ -343,6 +346,6 @@ def score_by_stages(S: Integral, cells: I32, stages: CompiledStages, seen: I32 |
     corners = np.empty((len(stages.boxes), 8), np.int64)
     set_corners(S, stages.boxes, corners)
     scores, alive = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
-    settings = (seen, 0, len(cells), to_stage, *tables.tables, corners, alive, *tables.memory())
+    settings = (seen, 0, len(cells), 0, to_stage, *tables.tables, corners, alive, *tables.memory())
     vote_stages(S, *ONE_SLAB, cells, *settings, scores)
     return scores

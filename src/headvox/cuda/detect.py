@@ -74,11 +74,13 @@ class OnDevice:
             raise nothing_in_range(asked.frame, asked.lattice.region)
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[found.yaws]
-        heads, poses = stated(found.centres, found.radii, found.scores, asked.least, yaws), found.poses
-        relief = self.cascade.relief
+        centres, radii, scores, poses = found.centres, found.radii, found.scores, found.poses
+        least, relief = asked.least, self.cascade.relief
         if relief is not None and asked.sees:
-            least = asked.least + relief.most
+            least += relief.most
             common = (asked.slack, asked.expected, asked.lattice.voxel_m)
-            heads, kept = look_again(heads, asked.frame.depths, relief, least, *common)
-            poses = None if poses is None else poses.of(kept, heads.centres)
+            kept, scores = look_again(centres, scores, asked.frame.depths, relief, least, *common)
+            centres, radii, yaws = centres[kept], radii[kept], None if yaws is None else yaws[kept]
+            poses = None if poses is None else poses.of(kept, centres)
+        heads = stated(centres, radii, scores, least, yaws)
         return heads if poses is None else with_poses(heads, poses)

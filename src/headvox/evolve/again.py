@@ -24,6 +24,7 @@ from headvox.evolve import boost, samples
 from headvox.evolve.samples import Grid, Samples, join, to_find
 from headvox.evolve.spoil import spoil
 from headvox.evolve.views import LEAST_VISIBLE, View
+from headvox.keep import Judged
 from headvox.masks.compile import SCORE_UNIT
 from headvox.memory import Memory
 from headvox.pipeline import Detector
@@ -61,10 +62,10 @@ class Watched(Detector):
     def _judge(
         self, frame: Frame, S: npt.NDArray[Any], survivors: I32, scores: I64, peaks: I64, memory: Memory,
         expected: Expected | None,
-    ) -> tuple[I32, I64, I64, int]:  # fmt: skip
-        cells, scores, peaks, least = super()._judge(frame, S, survivors, scores, peaks, memory, expected)
-        self.told = cells + memory.first.astype(np.int32), scores / SCORE_UNIT
-        return cells, scores, peaks, least
+    ) -> Judged:  # fmt: skip
+        judged = super()._judge(frame, S, survivors, scores, peaks, memory, expected)
+        self.told = judged.cells + memory.first.astype(np.int32), judged.scores / SCORE_UNIT
+        return judged
 
 
 @lru_cache(maxsize=1)

@@ -246,6 +246,9 @@ def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["eval", str(clouds), "--radius", "-1"]) == 2
     assert main(["eval", str(clouds), "--max-range", "-1"]) == 2
     assert main(["eval", "static", "--seed", "-1"]) == 2
+    capsys.readouterr()
+    assert main(["eval", "two-cameras", "--scheduler", "local"]) == 2
+    assert "two-cameras is made by --workers N of this machine" in capsys.readouterr().err
     assert main(["eval", str(clouds), "--against", "nonsense"]) == 1
     assert main(["eval", str(clouds), "-o", str(clouds / "0.npy")]) == 1
     capsys.readouterr()

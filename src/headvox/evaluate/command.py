@@ -174,11 +174,10 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
                 known.rotation(5, args.revolutions, args.seed),
             ]
         elif what == "two-cameras":
-            made.append(
-                known.two_cameras(
-                    args.walkers, args.frames, args.people, 100 + args.seed, Workers(args.workers)
-                )
-            )
+            if args.scheduler is not None:
+                raise UsageError("two-cameras is made by --workers N of this machine, not by a --scheduler")
+            workers = Workers(args.workers)
+            made.append(known.two_cameras(args.walkers, args.frames, args.people, 100 + args.seed, workers))
         elif what == "sample":
             made.append(replace(known.recording(sample_folder()), synthetic=True))
         elif what == "peers":

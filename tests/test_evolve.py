@@ -262,7 +262,7 @@ def test_the_same_samples_and_seed_give_the_same_file(evolved, monkeypatch):
     monkeypatch.setattr(samples, "RANGE_M", 2.8)
     _, found, _ = evolved
     gate = search._compile_gate(found.gate)
-    parts = [samples.search_samples(easy_view(None, 0, number), gate, None) for number in range(40)]
+    parts = [samples.search_samples(easy_view(None, 0, number), gate, None) for number in range(12)]
     joined = samples.join(part for part in parts if part is not None)
     texts = set()
     for seed in (0, 0, 1):

@@ -12,13 +12,13 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from headvox import __version__
 from headvox.commands import completion, doctor
 from headvox.commands import masks as masks_command
+from headvox.commands import run as run_command
 from headvox.commands.flags import (
     GOOD,
     INTERRUPTED,
@@ -27,25 +27,19 @@ from headvox.commands.flags import (
     UsageError,
     add_command,
     add_settings,
-    add_source,
     add_source_options,
     add_tracker_settings,
     config_of,
     keep_input,
-    place,
+    named,
     source_options_of,
     tracker_config_of,
 )
 from headvox.commands.table import printable, table
 from headvox.errors import HeadvoxError, Undecided
 from headvox.machine.interrupts import heeded
-from headvox.parallel.workers import add_flags, of_flags
 from headvox.render import command as render_command
-from headvox.sinks import SUFFIXES
 from headvox.view import command as view_command
-
-if TYPE_CHECKING:
-    from headvox.parallel.batch import Done
 
 # Commands that read their own flags: `headvox NAME ...` is main([...]) of a module, which returns the code.
 MODULES = {
@@ -155,82 +149,6 @@ def _forget_stdout() -> None:
 # ----------------------------------------------------------------------------------------------- commands
 
 
-def _run(args: argparse.Namespace) -> int:
-    if args.into is not None:
-        return _run_batch(args)
-    if args.more:
-        raise UsageError("several sources go with --into DIR, which gets a file of each")
-    if args.no_track and args.output is not None and args.output.suffix == ".tum":
-        raise UsageError("-o NAME.tum writes a file a track: it does not go with --no-track")
-    from headvox.commands.session import opened
-    from headvox.sinks import Sink, open_sink
-    from headvox.sinks.jsonl import JsonStream
-    from headvox.sinks.summary import summary
-    from headvox.sources.bag import BagSource
-
-    with opened(args, track=not args.no_track) as session, ExitStack() as stack:
-        sinks: list[Sink] = []
-        if args.output is not None:
-            source = session.source
-            frame = source.frame if isinstance(source, BagSource) else "world"
-            # Before the stream: what was printed is in the file, however the run ends.
-            keep_input(args.output, session.inputs)
-            sinks.append(stack.enter_context(closing(open_sink(args.output, frame))))
-        if args.json:
-            sinks.append(JsonStream(sys.stdout))
-        watch = None
-        if args.view is not None:
-            from headvox.view.watch import Watch
-
-            if args.view:
-                keep_input(args.view, session.inputs)
-            watch = stack.enter_context(closing(Watch(session.detector, args.view or None)))
-        report = session.run(sinks, on_result=watch.show if watch else None)
-        if watch is not None and watch.dropped:
-            session.live.note(f"headvox: {watch.dropped} frames were not shown: the viewer was busy")
-    if not args.json:
-        print(summary(report))
-    return INTERRUPTED if report.interrupted else GOOD
-
-
-def _run_batch(args: argparse.Namespace) -> int:
-    if (
-        args.json
-        or args.output is not None
-        or args.view is not None
-        or args.strict
-        or args.limit
-        or args.source is None
-    ):
-        raise UsageError(
-            "--into goes with one SOURCE or more, and with none of --json, -o, --view, --strict and --limit"
-        )
-    from headvox.commands.live import Live
-    from headvox.parallel.batch import Settings, run_batch
-
-    places = [str(place) for place in (args.source, *args.more)]
-    tracker = None if args.no_track else tracker_config_of(args)
-    settings = Settings(args.into, config_of(args), source_options_of(args), tracker)
-    rows = []
-    with closing(Live(sys.stderr, None)) as live:
-
-        def tell(done: Done) -> None:
-            rows.append([done.name, str(done.frames), str(done.heads), str(done.bad), _how(done)])
-            if done.failure:
-                live.note(f"headvox: {done.name}: {done.failure}")
-            live.show(f"{len(rows)} of {len(places)} done")
-
-        every = run_batch(places, settings, of_flags(args), tell)
-    print(table(["recording", "frames", "heads", "bad frames", ""], rows))
-    return KNOWN_ERROR if any(done.failure for done in every) else GOOD
-
-
-def _how(done: Done) -> str:
-    if done.failure:
-        return "failed"
-    return "was there already" if done.was_there else "done"
-
-
 def _convert(args: argparse.Namespace) -> int:
     from headvox.commands.convert import convert
     from headvox.commands.live import Live
@@ -313,45 +231,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"headvox {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    run = add_command(
-        commands, "run", _run, "find heads in a recording, a bag, a cloud, or a folder of clouds"
-    )
-    add_source(run)
-    run.add_argument("more", nargs="*", type=place, metavar="SOURCE", help="more of them, with --into")
-    run.add_argument(
-        "--into",
-        type=Path,
-        metavar="DIR",
-        help="write NAME.jsonl of each source there; what is there already is not done again",
-    )
-    add_flags(run, 1)
-    run.add_argument("--json", action="store_true", help="print one JSON object a frame, and nothing else")
-    run.add_argument(
-        "-o",
-        dest="output",
-        type=output_file,
-        metavar="OUT",
-        help=f"also write a file: {_either(SUFFIXES)}; NAME.tum writes a trajectory a track, NAME_ID.tum",
-    )
-    run.add_argument(
-        "--no-track",
-        action="store_true",
-        help="every frame by itself: bare detections, without ids and velocities",
-    )
-    run.add_argument(
-        "--view",
-        nargs="?",
-        const=False,
-        type=view_command.rrd_file,
-        metavar="OUT.rrd",
-        help="show the run in rerun's viewer, or write a file for it: ten frames a second at most, never waited for",
-    )
-    add_settings(run)
-    add_tracker_settings(run)
-    run.usage = (
-        "%(prog)s [SOURCE] [--json] [-o OUT] [flags]\n       %(prog)s SOURCE [SOURCE ...] --into DIR [flags]"
-    )
-
+    run_command.add_to(commands)
     info = add_command(commands, "info", _info, "tell what a source holds")
     info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
     add_source_options(info)
@@ -363,7 +243,7 @@ def _parser() -> argparse.ArgumentParser:
     conversion.add_argument(
         "-o",
         dest="output",
-        type=bag_file,
+        type=named(".mcap"),
         required=True,
         metavar="OUT.mcap",
         help="messages of ROS 2, without ROS",
@@ -382,30 +262,21 @@ def _parser() -> argparse.ArgumentParser:
     render_command.add_to(commands)
     masks_command.add_to(commands)
     doctor.add_to(commands)
-    completion.add_to(commands)
+    completion.add_to(commands, _whole_parser)
     for name, (_, text) in MODULES.items():
         commands.add_parser(name, help=text)
     return parser
 
 
-def output_file(text: str) -> Path:
-    """Return the path of a file that a sink can write."""
-    path = Path(text)
-    if path.suffix not in SUFFIXES:
-        raise argparse.ArgumentTypeError(f"expected a name that ends with {_either(SUFFIXES)}, got {text!r}")
-    return path
-
-
-def bag_file(text: str) -> Path:
-    """Return the path of a bag that can be written."""
-    path = Path(text)
-    if path.suffix != ".mcap":
-        raise argparse.ArgumentTypeError(f"expected a name that ends with .mcap, got {text!r}")
-    return path
-
-
-def _either(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:-1])} or {names[-1]}"
+def _whole_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line, with those of the commands that read their own flags in it."""
+    parser = _parser()
+    commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    for name, (module, _) in MODULES.items():
+        own = importlib.import_module(module)._parser()
+        own.prog = f"headvox {name}"
+        commands.choices[name] = own
+    return parser
 
 
 if __name__ == "__main__":

@@ -114,6 +114,25 @@ def place(text: str) -> Path | str:
     return text if is_remote(text) else Path(text)
 
 
+def named(*suffixes: str) -> Callable[[str], Path]:
+    """Return what reads the name of a file that ends with one of ``suffixes``, for argparse."""
+
+    def file(text: str) -> Path:
+        path = Path(text)
+        if path.suffix not in suffixes:
+            raise argparse.ArgumentTypeError(
+                f"expected a name that ends with {either(suffixes)}, got {text!r}"
+            )
+        return path
+
+    return file
+
+
+def either(names: Sequence[str]) -> str:
+    """Return "a", "a or b", "a, b or c"."""
+    return " or ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
+
+
 def add_source_options(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each thing that a bag may not tell by itself."""
     group = parser.add_argument_group("bags and cameras", "what they do not tell by themselves")

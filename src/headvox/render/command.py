@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from headvox.commands.flags import (
@@ -15,6 +14,7 @@ from headvox.commands.flags import (
     add_source,
     add_tracker_settings,
     keep_input,
+    named,
     seed_number,
 )
 
@@ -34,7 +34,7 @@ def add_to(commands: Commands) -> None:
     render.add_argument(
         "-o",
         dest="output",
-        type=_film_file,
+        type=named(*SUFFIXES),
         required=True,
         metavar="OUT",
         help="NAME.mp4, NAME.gif or NAME.png",
@@ -46,13 +46,6 @@ def add_to(commands: Commands) -> None:
     add_settings(render)
     add_tracker_settings(render)
     render.usage = "%(prog)s [SOURCE] -o OUT [flags]"
-
-
-def _film_file(text: str) -> Path:
-    path = Path(text)
-    if path.suffix not in SUFFIXES:
-        raise argparse.ArgumentTypeError(f"expected a name that ends with .gif, .mp4 or .png, got {text!r}")
-    return path
 
 
 def _width(text: str) -> int:

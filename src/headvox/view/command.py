@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from headvox.commands.flags import (
@@ -14,6 +13,7 @@ from headvox.commands.flags import (
     add_source,
     add_tracker_settings,
     keep_input,
+    named,
 )
 
 if TYPE_CHECKING:
@@ -27,20 +27,13 @@ def add_to(commands: Commands) -> None:
     view.add_argument(
         "-o",
         dest="output",
-        type=rrd_file,
+        type=named(".rrd"),
         metavar="OUT.rrd",
         help="write a file for the viewer instead of showing it",
     )
     add_settings(view)
     add_tracker_settings(view)
     view.usage = "%(prog)s [SOURCE] [-o OUT.rrd] [flags]"
-
-
-def rrd_file(text: str) -> Path:
-    """Return the path of a file that rerun can open."""
-    if Path(text).suffix != ".rrd":
-        raise argparse.ArgumentTypeError(f"expected a name that ends with .rrd, got {text!r}")
-    return Path(text)
 
 
 def _view(args: argparse.Namespace) -> int:

@@ -177,7 +177,7 @@ def test_two_reports_are_compared(clouds: Path, tmp_path: Path, capsys: pytest.C
     assert main(["eval", "compare", reports[0], reports[0]]) == 0
     assert "No figure differs" in capsys.readouterr().out
     assert main(["eval", "compare", reports[0], str(clouds / "heads.jsonl")]) == 1
-    assert "expected a report" in capsys.readouterr().err
+    assert "expected a report of `headvox eval -o`" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -251,11 +251,13 @@ def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert "two-cameras is made by --workers N of this machine" in capsys.readouterr().err
     assert main(["eval", str(clouds), "--against", "nonsense"]) == 1
     assert main(["eval", str(clouds), "-o", str(clouds / "0.npy")]) == 1
+    assert "Cannot make the folder" in capsys.readouterr().err
     capsys.readouterr()
     (clouds / "heads.jsonl").unlink()
     assert main(["eval", str(clouds)]) == 1
     assert "there is no heads.jsonl beside it" in capsys.readouterr().err
     assert main(["eval", str(tmp_path / "nothing")]) == 1
+    assert "there is no such file or folder" in capsys.readouterr().err
 
 
 def test_which_frames_a_cascade_was_tuned_on() -> None:

@@ -401,5 +401,6 @@ def test_the_command_exits_with_two_when_in_doubt(tmp_path):
 
 
 def test_options_of_bags_are_refused_elsewhere():
-    with pytest.raises(HeadvoxError, match="for bags"):
-        open_source(sample_folder(), SourceOptions(frame="world"))
+    for unused in (SourceOptions(frame="world"), SourceOptions(T_world_mount=mount(0, 0, 1, 0, 0, 0))):
+        with pytest.raises(HeadvoxError, match="for bags"):
+            open_source(sample_folder(), unused)

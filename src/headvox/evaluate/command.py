@@ -27,6 +27,7 @@ from headvox.commands.flags import (
 )
 from headvox.commands.live import Live
 from headvox.commands.table import file_name, printable
+from headvox.errors import HeadvoxError
 from headvox.parallel.workers import Workers, add_flags, of_flags
 from headvox.sample import sample_folder
 
@@ -96,7 +97,7 @@ def _report(args: argparse.Namespace) -> int:
     made = _made(plan, args)  # what is wrong with a cascade, or with the folder, is told now
     if args.output is not None:
         need_matplotlib()
-        args.output.mkdir(parents=True, exist_ok=True)
+        _make(args.output)
     scores: list[Scores] = []
     recorded: dict[str, list[Outcome]] = {}
     with closing(Live(sys.stderr, None)) as live:
@@ -128,6 +129,13 @@ def _report(args: argparse.Namespace) -> int:
     for line in missed:
         print(printable(f"headvox: limit missed: {line}"), file=sys.stderr)
     return LIMIT_MISSED if missed else GOOD
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HeadvoxError(f"Cannot make the folder {folder}: {error.strerror}.", "Choose another.") from None
 
 
 def _plan(args: argparse.Namespace) -> Plan:

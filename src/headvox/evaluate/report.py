@@ -41,7 +41,7 @@ class Report:
         Raises:
             HeadvoxError: no such file, or something else in it.
         """
-        wrong = HeadvoxError(f"{path}: expected a report of `headvox eval --json-file`.", "Check the path.")
+        wrong = HeadvoxError(f"{path}: expected a report of `headvox eval -o`.", "Check the path.")
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
         except OSError as error:

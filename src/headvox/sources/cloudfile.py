@@ -115,9 +115,9 @@ def _reader(head: bytes, name: str) -> Callable[[bytes, str], CloudFile]:
 
         return read_pcd
     raise HeadvoxError(
-        f"{name}: expected a ply, pcd, npy or npz file, it begins with {head[:12]!r}."
+        f"{name}: expected a bag, or a ply, pcd, npy or npz file, it begins with {head[:12]!r}."
         if head
-        else f"{name}: the file is empty, expected a ply, pcd, npy or npz file.",
+        else f"{name}: the file is empty, expected a bag, or a ply, pcd, npy or npz file.",
         "Convert it to one of these, or give the folder of a recording.",
     )
 

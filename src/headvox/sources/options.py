@@ -39,9 +39,16 @@ def check_unused(options: SourceOptions | None, name: str) -> None:
     Raises:
         HeadvoxError: one of them is set.
     """
-    if options is not None and options != SourceOptions():
+    # One by one: a matrix has no truth, so options cannot be compared as a whole.
+    if options is not None and (
+        options.topics
+        or options.frame is not None
+        or options.T_world_mount is not None
+        or options.extrinsics is not None
+    ):
         raise HeadvoxError(
-            f"{name}: --topic, --frame, --mount and --extrinsics are for bags and live cameras only.",
+            f"{name}: --topic, --frame and --mount are for bags and live cameras, --extrinsics for recordings "
+            "and live cameras only.",
             "Leave them out.",
         )
 

@@ -51,8 +51,11 @@ class Memory:
         self.S = _touched((self.cut(lattice.shape[0], threads).slices * math.prod(slice_shape),), sum_type)
         self.row = [row_for(slice_shape[1], sum_type) for _ in range(threads)]
         self.index = np.zeros(slices * math.prod(slice_shape), np.int32)
+        self.lowest = self.reach[0::2]
         self.first = np.zeros(3, np.int64)
-        """The cell that the integral volume begins at."""
+        """The cell that the integral volume begins at,"""
+        self.region = np.zeros(6, np.int64)
+        """and which of its voxels are searched: x0 x1 y0 y1 z0 z1, half-open."""
         self.gate = gate_tables(cascade.gate, self.S.dtype)
         self.gate_corners = np.empty((len(cascade.gate.boxes), 8), np.int64)
         self.candidate_reach = candidate_reach(cascade.gate)
@@ -85,10 +88,11 @@ class Memory:
 
         It has margins for whatever box is looked up there.
         """
-        slices, *rest = (candidates[3:] - candidates[:3] + 1).tolist()
-        slabs = self.cut(slices, threads)
-        shape = (slabs.slices, *shape_with_margins((slices, *rest), self.reach)[1:])
-        self.first = candidates[:3] + self.reach[0::2]
+        searched = (candidates[3:] - candidates[:3] + 1).tolist()
+        slabs = self.cut(searched[0], threads)
+        shape = (slabs.slices, *shape_with_margins(searched, self.reach)[1:])
+        self.first = candidates[:3] + self.lowest
+        self.region[0::2], self.region[1::2] = -self.lowest, searched - self.lowest
         S: npt.NDArray[Any] = self.S[: math.prod(shape)].reshape(shape)
         return S
 

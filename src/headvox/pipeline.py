@@ -127,9 +127,8 @@ class Detector:
             memory = self._memory_for(frame)
             occupied = self._voxelize(frame, memory)
             clock.done("voxelize")
-            candidates = memory.candidates_about(occupied)
-            S = memory.volume_about(candidates, self._threads.count)
-            survivors = self._gate(S, occupied, candidates, memory, clock)
+            S = memory.volume_about(memory.candidates_about(occupied), self._threads.count)
+            survivors = self._gate(S, occupied, memory, clock)
             clock.done("gate")
             scores = self._vote(S, survivors, memory)
             clock.done("vote")
@@ -221,11 +220,9 @@ class Detector:
             raise nothing_in_range(frame, lattice.region)
         return occupied
 
-    def _gate(self, S: npt.NDArray[Any], occupied: I64, candidates: I64, memory: Memory, clock: Clock) -> I32:
+    def _gate(self, S: npt.NDArray[Any], occupied: I64, memory: Memory, clock: Clock) -> I32:
         """Fill the integral volume ``S``, and return the voxels of it that pass the gate."""
-        region = np.empty(6, np.int64)
-        region[0::2], region[1::2] = candidates[:3], candidates[3:] + 1
-        region -= memory.first.repeat(2)
+        region = memory.region
         shape = shape_of_passed(region)
         passed = memory.passed[: math.prod(shape)].reshape(shape)
         set_corners(S, self.cascade.gate.boxes, memory.gate_corners)

@@ -32,7 +32,7 @@ SHARES = (8, 4, 2, 1)  # every 8th point, every 4th, ...
 BOX_VOXELS = (3, 5, 9, 13, 17, 21)
 OPEN3D_EVERY = 5  # it takes as long as many of the others together
 COPY, OPEN3D = "np.copy of the cloud", "Open3D voxel_down_sample, 2.5 cm"
-STEPS = 8000
+STEPS = 16_000
 PLAIN = f"a plain loop of {STEPS} steps"
 
 # A gate whose eight boxes nothing can fill, and a box of full size that only keeps the searched volume, and the type

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import COMMAND, Done
+from command import headvox as run_headvox
 
 import headvox
 from headvox import cli
@@ -18,13 +20,11 @@ from headvox.data import Frame
 from headvox.sources import open_source
 from headvox.synth import presets, record
 
-COMMAND = Path(sys.executable).with_name("headvox")
 SAMPLE = Path(headvox.__file__).parent / "assets" / "sample"
 
 
-def synth(*arguments) -> subprocess.CompletedProcess:
-    command = [str(COMMAND), "synth", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+def synth(*arguments: object) -> Done:
+    return run_headvox("synth", *arguments)
 
 
 def contents(folder):

@@ -63,11 +63,11 @@ def keep(
     """
     kept: npt.NDArray[np.bool_] = scores >= least
     if expected is not None and len(expected):
-        kept |= (scores >= least - slack) & _is_expected(centres, expected, voxel_m)
+        kept |= (scores >= least - slack) & is_expected(centres, expected, voxel_m)
     return kept
 
 
-def _is_expected(centres: F64, expected: Expected, voxel_m: float) -> npt.NDArray[np.bool_]:
+def is_expected(centres: F64, expected: Expected, voxel_m: float) -> npt.NDArray[np.bool_]:
     """Return whether each of ``centres`` is within reach of any place where a head is expected."""
     away = np.linalg.norm(centres[:, None] - expected.centres, axis=2)
     within: npt.NDArray[np.bool_] = (away <= expected.reaches_m + voxel_m).any(axis=1)

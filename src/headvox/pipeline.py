@@ -33,6 +33,7 @@ from headvox.refine import fit_spheres
 from headvox.relief import look_again
 from headvox.slabs import shares_of
 from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, best_of_each, local_maxima
+from headvox.verify import verify
 from headvox.visibility import count_states, look_about
 from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import NO_BOX, empty, join_boxes, mark_depth, mark_points
@@ -354,15 +355,15 @@ class Detector:
         self._score(S, cells, seen, judge, judge.seeing, memory, scores)
 
     def _refine(self, frame: Frame, judged: Judged, memory: Memory, expected: Expected | None) -> Heads:
-        """Fit spheres, take the best of those that overlap, look again pixel by pixel, and fit poses."""
+        """Fit spheres, take the best of those that overlap, look again pixel by pixel, fit poses, and verify."""
         cells, centres, scores, peaks, least = judged
         if len(cells) == 0:
             return Heads()
         spheres = None if self.config.refine == "none" else self._fit_spheres(cells, memory)
         kept, centres, radii = best_apart(centres, scores, spheres, haired=knows_an_origin(frame))
         scores, relief = scores[kept], self.cascade.relief
+        limits = (least, slack_of(self.config, expected), expected, memory.lattice.voxel_m)
         if relief is not None and asks_cameras(frame, memory.sees):
-            limits = (least, slack_of(self.config, expected), expected, memory.lattice.voxel_m)
             again, scores = look_again(centres, scores, frame.depths, relief, *limits)
             kept, centres, radii = kept[again], centres[again], radii[again]
         votes = self.cascade.votes
@@ -370,8 +371,11 @@ class Detector:
         heads = stated(centres, radii, scores, least, yaws)
         if self.config.refine != "pose":
             return heads
-        best = heads.centres[:MOST_POSES]
-        return with_poses(heads, fit_poses(frame, best, memory.fits, self._threads, expected))
+        poses = fit_poses(frame, heads.centres[:MOST_POSES], memory.fits, self._threads, expected)
+        rule = self.cascade.source.verification
+        if rule is not None:
+            heads, poses = verify(heads, poses, rule, *limits)
+        return with_poses(heads, poses)
 
     def _fit_spheres(self, cells: I32, memory: Memory) -> F64:
         """Return the spheres (N, 6) that fit what lies about ``cells`` (N, 3) of the integral volume."""

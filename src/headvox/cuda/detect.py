@@ -16,6 +16,7 @@ from headvox.masks.compile import CompiledCascade
 from headvox.placing import Placing
 from headvox.relief import look_again
 from headvox.suppress import AROUND, MOST_PEAKS
+from headvox.verify import verify
 from headvox.voxelize import Lattice
 
 DEVICE_STAGES = ("device", "host")
@@ -75,12 +76,16 @@ class OnDevice:
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[found.yaws]
         centres, radii, scores, poses = found.centres, found.radii, found.scores, found.poses
-        least, relief = asked.least, self.cascade.relief
+        least, relief, rule = asked.least, self.cascade.relief, self.cascade.source.verification
+        common = (asked.slack, asked.expected, asked.lattice.voxel_m)
         if relief is not None and asked.sees:
             least += relief.most
-            common = (asked.slack, asked.expected, asked.lattice.voxel_m)
             kept, scores = look_again(centres, scores, asked.frame.depths, relief, least, *common)
             centres, radii, yaws = centres[kept], radii[kept], None if yaws is None else yaws[kept]
             poses = None if poses is None else poses.of(kept, centres)
         heads = stated(centres, radii, scores, least, yaws)
-        return heads if poses is None else with_poses(heads, poses)
+        if poses is None:
+            return heads
+        if rule is not None:
+            heads, poses = verify(heads, poses, rule, least, *common)
+        return with_poses(heads, poses)

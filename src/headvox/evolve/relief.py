@@ -31,7 +31,7 @@ from headvox.relief import relief_about
 LEAST_SCORE = -5.0  # of the peaks that are looked at
 MOST_SPOTS = 48  # chosen by what a short boosting over all gains from them
 CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE = 100, 0.15, 0.2
-TREES, RATE, SHARE_OF_FEATURES = 150, 0.1, 0.35
+TREES, RATE, SHARE_OF_FEATURES = 300, 0.1, 0.35
 LEAVES, LEAST_ROWS = 4, 80
 MOST = 2.0  # how far the score may change
 

@@ -32,6 +32,7 @@ from headvox.evolve.samples import (
     search_samples,
     without_new_heads,
 )
+from headvox.evolve.verify import Fits, fit_verification, spoilt_fits
 from headvox.evolve.views import View, keep_view
 from headvox.evolve.write import Found, cascade_text, write_cascade
 from headvox.masks.cascade import Cascade, Condition
@@ -106,7 +107,8 @@ def evolve(settings: Settings, say: Say) -> Found:
             break
         best, best_recall = found, recall
     assert best is not None
-    return _with_last_look(settings, _with_second_opinion(settings, best, say), say)
+    found = _with_last_look(settings, _with_second_opinion(settings, best, say), say)
+    return _with_verification(settings, found, say)
 
 
 def _with_second_opinion(settings: Settings, found: Found, say: Say) -> Found:
@@ -145,6 +147,18 @@ def _with_last_look(settings: Settings, found: Found, say: Say) -> Found:
     found, recall = _with_thresholds(settings, path, found)
     say(f"looked again: {100 * recall:.1f} % of the heads kept aside at {FALSE_A_FRAME:g} false a frame")
     return found
+
+
+def _with_verification(settings: Settings, found: Found, say: Say) -> Found:
+    """Return ``found`` with what the pose fit may take from a score; the thresholds stay, for who fits no poses."""
+    path = settings.work / "sharp.toml"
+    write_cascade(path, settings.name, found)
+    parts = [part for part in _of_views(settings, partial(spoilt_fits, cascade=path)) if part is not None]
+    rule = fit_verification(Fits.join(parts)) if parts else None
+    if rule is None:
+        return found
+    say(f"verification: a unit of misfit costs {rule.misfit:g}, a centimetre of radius {rule.radius / 100:g}")
+    return replace(found, verification=rule)
 
 
 def _claim(settings: Settings) -> None:

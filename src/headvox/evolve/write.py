@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from headvox.atomic import write_text
 from headvox.evolve.bank import OCCUPIED, SEEN, SUBDIVISION, VOXEL_M
 from headvox.evolve.boost import Fitted
-from headvox.masks.cascade import Condition, Group, Relief
+from headvox.masks.cascade import Condition, Group, Relief, Verification
 
 WHY = {
     "crown": "the upper half is there", "beside": "about the crown there is less than in it",
@@ -34,6 +34,7 @@ class Found:
     min_score_occupied: float = 0.0
     tuned_on: tuple[str, ...] = ()
     relief: Relief | None = None
+    verification: Verification | None = None
 
 
 def write_cascade(path: Path, name: str, found: Found) -> None:
@@ -88,7 +89,7 @@ def cascade_text(name: str, found: Found) -> str:
         at = ['at = "peaks"'] if stage in found.judge else []
         lines += ["[[stage]]", f'name = "{stage.plan.name}"', *at, *keep, "trees = ["]
         lines += [*(f"  {tree}," for tree in its_trees), "]", ""]
-    return "\n".join(lines + relief_lines(found.relief))
+    return "\n".join(lines + relief_lines(found.relief) + verification_lines(found.verification))
 
 
 def relief_lines(relief: Relief | None) -> list[str]:
@@ -98,6 +99,17 @@ def relief_lines(relief: Relief | None) -> list[str]:
     spots = [f"{spot.name} = [{spot.side:g}, {spot.up:g}]" for spot in relief.spots]
     trees = [f"  {json.dumps(tree)}," for tree in relief.trees]
     return ["[relief]", f"most = {relief.most:g}", "trees = [", *trees, "]", "", "[relief.spots]", *spots, ""]
+
+
+def verification_lines(rule: Verification | None) -> list[str]:
+    """Return the verification as lines of TOML."""
+    if rule is None:
+        return []
+    return [
+        "[verification]",
+        *(f"{entry.name} = {getattr(rule, entry.name):g}" for entry in fields(rule)),
+        "",
+    ]
 
 
 def _numbers(values: Sequence[float]) -> str:

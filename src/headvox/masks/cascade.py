@@ -105,6 +105,22 @@ class Relief:
 
 
 @dataclass(frozen=True, slots=True)
+class Verification:
+    """What the pose fit may take from a score: ``misfit`` for each unit of misfit, ``radius`` for each metre off.
+
+    The radius is off as far as it is from ``radius_m``. What these come to beyond ``free`` is lost, ``most`` at most,
+    where the fit states the centre to less than ``sure_m`` (m, one standard deviation).
+    """
+
+    most: float
+    sure_m: float
+    free: float
+    misfit: float
+    radius: float
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class Cascade:
     """A cascade as its file has it. Exactly one of ``votes`` and ``stages`` is there."""
 
@@ -125,7 +141,9 @@ class Cascade:
     judge: tuple[Stage, ...] = ()
     """Stages that score the voxels about the peaks of ``stages`` anew."""
     relief: Relief | None = None
-    """What has the last word, where depth images were seen."""
+    """The last look, where depth images were seen."""
+    verification: Verification | None = None
+    """What the pose fit has to say, where poses are fitted."""
 
     @property
     def every_stage(self) -> tuple[Stage, ...]:

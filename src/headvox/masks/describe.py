@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from headvox.commands.table import printable, table
-from headvox.masks.cascade import Cascade, Condition, Group, Relief, Stage, Votes, cuts
+from headvox.masks.cascade import Cascade, Condition, Group, Relief, Stage, Verification, Votes, cuts
 from headvox.masks.compile import volume, voxel_box
 
 LOOK_UPS_A_BOX = 8
@@ -22,6 +22,8 @@ def describe_cascade(cascade: Cascade) -> str:
         parts += [_groups(cascade), _stages(cascade)]
     if cascade.relief is not None:
         parts.append(_relief(cascade.relief))
+    if cascade.verification is not None:
+        parts.append(_verification(cascade.verification))
     return "\n\n".join(parts)
 
 
@@ -179,6 +181,14 @@ def _relief(relief: Relief) -> str:
         f"score by {relief.most:g} at most"
     )
     return f"{heading}\n{table(['spot', 'to either side (m)', 'up (m)', 'cuts'], rows)}"
+
+
+def _verification(rule: Verification) -> str:
+    return (
+        f"Verification, by the pose fit: lowers the score by {rule.misfit:g} x misfit + {rule.radius:g} x (metres that "
+        f"the radius is off {rule.radius_m:g}) - {rule.free:g},\nby {rule.most:g} at most, where the centre is stated "
+        f"to {rule.sure_m:g} m"
+    )
 
 
 def _at(cascade: Cascade, stage: Stage) -> str:

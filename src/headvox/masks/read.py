@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import suppress
+from dataclasses import fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from headvox.masks.cascade import (
     Spot,
     Stage,
     Tree,
+    Verification,
     Votes,
     cuts,
     ring,
@@ -264,6 +266,11 @@ class _Reader:
         most = self.number(table.get("most"), "relief.most", 0.0, 1000.0)
         return Relief(most, tuple(spots), tuple(self.tree(tree, features, "relief.trees") for tree in trees))
 
+    def verification(self, value: object) -> Verification:
+        names = [entry.name for entry in fields(Verification)]
+        table = self.table(value, "verification", set(names))
+        return Verification(*(self.number(table.get(name), f"verification.{name}", 0.0) for name in names))
+
     def cascade(self, value: dict[str, Any]) -> Cascade:
         known = {"format", "version", "name", "summary", "voxel_m", "subdivision", "occupancy", "gate"}
         known |= {
@@ -275,6 +282,7 @@ class _Reader:
             "tuned_on",
             "candidates",
             "relief",
+            "verification",
         }
         table = self.table(value, "the file", known)
         if table.get("format") != FORMAT or table.get("version") != 1:
@@ -338,4 +346,5 @@ class _Reader:
             spacing=SPACINGS[candidates],
             judge=judge,
             relief=self.relief(table["relief"]) if "relief" in table else None,
+            verification=self.verification(table["verification"]) if "verification" in table else None,
         )

@@ -29,9 +29,8 @@ from headvox.pipeline import Detector
 from headvox.pose.fit import FitMemory, fit_poses
 
 LEAST_SCORE = -3.5  # of the heads to which poses are fitted
-SURE_M = (
-    0.03  # heads that the border cuts, or of which a camera sees little, fit badly, too; then this is stated
-)
+# Heads that the border cuts, or of which a camera sees little, fit badly, too; then the fit states more than this.
+SURE_M = 0.03
 MOST = 2.0  # how far the score may fall
 
 

@@ -32,7 +32,6 @@ RARE_SHARES = (0.12, 0.08, 0.14, 0.30, 0.16, 0.12, 0.08)  # of POSTURES
 SHELL_POINTS = 9000
 EXTRINSICS_SIGMA_M, EXTRINSICS_SIGMA_RAD = 0.012, 0.005
 CUT_SHARE = 0.08  # of the views whose background is missing
-UNSURE, CLEAR = 0, 1
 LEAST_VISIBLE = 0.25
 
 Rng = np.random.Generator

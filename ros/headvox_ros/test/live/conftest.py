@@ -33,6 +33,12 @@ START_S = 240.0  # the first run of a new version compiles
 WAIT_S = 60.0  # far more than it takes: machines that test are busy
 
 
+def pytest_configure() -> None:
+    """Heed Ctrl-C, as the nodes then do: what a shell starts in the background ignores it, and so would they."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 class Process:
     """A node of the package, in a process of its own."""
 

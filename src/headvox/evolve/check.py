@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from headvox.config import DetectorConfig
-from headvox.data import F64, Cloud, Frame
+from headvox.data import F64, Cloud, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.evaluate.match import Rules, match
 from headvox.evolve.samples import RANGE_M, to_find
@@ -52,6 +53,20 @@ def detector_for(cascade: str, voxel_m: float | None = None) -> Detector:
         cascade=cascade, max_range_m=RANGE_M, min_score=LEAST_SCORE, refine="sphere", voxel_m=voxel_m
     )
     return Detector(config)
+
+
+def heads_in(view: View, cascade: Path, least: float) -> Heads | None:
+    """Return the heads of ``view`` that score ``least``, with spheres fitted, or None: nothing is in range."""
+    try:
+        return _detector(cascade, cascade.stat().st_mtime_ns, least).detect_frame(view.frame)
+    except HeadvoxError:
+        return None
+
+
+@lru_cache(maxsize=1)
+def _detector(cascade: Path, written_ns: int, least: float) -> Detector:
+    settings = DetectorConfig(cascade=str(cascade), max_range_m=RANGE_M, min_score=least, refine="sphere")
+    return Detector(settings, backend="cpu")
 
 
 def look_at(views: Iterable[View], detector: Detector, as_clouds: bool = False) -> Outcome:

@@ -9,23 +9,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from headvox.config import DetectorConfig
 from headvox.data import F64
-from headvox.errors import HeadvoxError
 from headvox.evolve import samples
 from headvox.evolve.again import label_places
 from headvox.evolve.boost import train
+from headvox.evolve.check import heads_in
 from headvox.evolve.spoil import spoil
 from headvox.evolve.views import View
 from headvox.masks.cascade import SIDES, Relief, Spot, Tree
-from headvox.pipeline import Detector
 from headvox.relief import relief_about
 
 LEAST_SCORE = -5.0  # of the peaks that are looked at
@@ -59,14 +56,6 @@ class Looks:
         return cls(*map(np.concatenate, columns))
 
 
-@lru_cache(maxsize=1)
-def _detector(cascade: Path, written_ns: int) -> Detector:
-    settings = DetectorConfig(
-        cascade=str(cascade), max_range_m=samples.RANGE_M, min_score=LEAST_SCORE, refine="sphere"
-    )
-    return Detector(settings, backend="cpu")
-
-
 def spoilt_looks(view: View, cascade: Path) -> Looks | None:
     """Return what is seen about the peaks of ``view``, spoilt, or None: there are none, or it is kept aside."""
     if not view.frame.depths or view.frame.clouds or samples.is_aside(np.array([view.number]))[0]:
@@ -76,10 +65,8 @@ def spoilt_looks(view: View, cascade: Path) -> Looks | None:
 
 def looks_at(view: View, cascade: Path) -> Looks | None:
     """Return what is seen about the peaks that are certainly a head or none."""
-    detector = _detector(cascade, cascade.stat().st_mtime_ns)
-    try:
-        heads = detector.detect_frame(view.frame)
-    except HeadvoxError:  # nothing in range
+    heads = heads_in(view, cascade, LEAST_SCORE)
+    if heads is None:
         return None
     label, _ = label_places(view, heads.centres)
     known = np.flatnonzero(label >= 0)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +15,14 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from headvox.assemble import MOST_POSES
-from headvox.config import DetectorConfig
 from headvox.data import F64
-from headvox.errors import HeadvoxError
 from headvox.evolve import samples
 from headvox.evolve.again import label_places
+from headvox.evolve.check import heads_in
 from headvox.evolve.spoil import spoil
 from headvox.evolve.views import View
 from headvox.machine.threads import Threads
 from headvox.masks.cascade import Verification
-from headvox.pipeline import Detector
 from headvox.pose.fit import FitMemory, fit_poses
 
 LEAST_SCORE = -3.5  # of the heads to which poses are fitted
@@ -49,14 +46,6 @@ class Fits:
         return cls(*(np.concatenate([getattr(part, entry.name) for part in parts]) for entry in fields(cls)))
 
 
-@lru_cache(maxsize=1)
-def _detector(cascade: Path, written_ns: int) -> Detector:
-    settings = DetectorConfig(
-        cascade=str(cascade), max_range_m=samples.RANGE_M, min_score=LEAST_SCORE, refine="sphere"
-    )
-    return Detector(settings, backend="cpu")
-
-
 def spoilt_fits(view: View, cascade: Path) -> Fits | None:
     """Return what is fitted in ``view``, spoilt, or None: there is nothing, no camera, or it is kept aside."""
     if not view.frame.depths or view.frame.clouds or samples.is_aside(np.array([view.number]))[0]:
@@ -66,9 +55,8 @@ def spoilt_fits(view: View, cascade: Path) -> Fits | None:
 
 def fits_in(view: View, cascade: Path) -> Fits | None:
     """Return what is fitted to what is certainly a head or none."""
-    try:
-        heads = _detector(cascade, cascade.stat().st_mtime_ns).detect_frame(view.frame)
-    except HeadvoxError:  # nothing in range
+    heads = heads_in(view, cascade, LEAST_SCORE)
+    if heads is None:
         return None
     centres = heads.centres[:MOST_POSES]
     poses = fit_poses(view.frame, centres, FitMemory.new(1, MOST_POSES), Threads(1))

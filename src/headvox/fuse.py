@@ -33,7 +33,7 @@ class Region:
 
 
 @rule
-def inside(x, y, z, limits):  # type: ignore[no-untyped-def]
+def inside(x, y, z, limits):
     """Tell whether a world point is within range and height. False for NaN: every comparison with NaN is."""
     dx = x - limits[0]
     dy = y - limits[1]

@@ -24,7 +24,7 @@ FIRSTS = np.uint32(0x55555555)  # of each pair of bits
 
 
 @rule
-def box_sums_at(flat, at, corners, b):  # type: ignore[no-untyped-def]
+def box_sums_at(flat, at, corners, b):
     """Return the sums over box ``b`` about :data:`LANES` voxels, each two above the one before.
 
     ``at`` tells the first, see :func:`headvox.integral.set_corners`.
@@ -42,7 +42,7 @@ def box_sums_at(flat, at, corners, b):  # type: ignore[no-untyped-def]
 
 
 @rule
-def holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[no-untyped-def]
+def holds(flat, at, corners, weights, spans, rank, limits, i):
     """Return a bit for each of :data:`LANES` voxels: whether condition ``i``'s statistic lies within its limits."""
     # Unsigned, because a signed index costs a check for counting from the end.
     begin, end = np.uint64(spans[i, 0]), np.uint64(spans[i, 1])
@@ -62,9 +62,7 @@ def holds(flat, at, corners, weights, spans, rank, limits, i):  # type: ignore[n
 
 
 @bare_kernel
-def gate_columns(  # type: ignore[no-untyped-def]
-    S, region, shift, weights, spans, rank, limits, spacing, odd, corners, blocks, passed
-):
+def gate_columns(S, region, shift, weights, spans, rank, limits, spacing, odd, corners, blocks, passed):
     """Write to ``passed`` (slices, ny, words a column) a bit for each voxel of ``region``: whether it passes.
 
     The bits of a word are for every other voxel, from 64 k on in word 2 k of a column, from 64 k + 1 on in the next.
@@ -105,13 +103,13 @@ def gate_columns(  # type: ignore[no-untyped-def]
 
 
 @rule
-def lowest_bits(count):  # type: ignore[no-untyped-def]
+def lowest_bits(count):
     """Return the ``count`` lowest bits set, or as many as there are, or none."""
     return ALL >> np.uint32(LANES - count) if 0 < count < LANES else (ALL if count > 0 else np.uint32(0))
 
 
 @bare_kernel
-def list_passed(passed, region, survivors):  # type: ignore[no-untyped-def]
+def list_passed(passed, region, survivors):
     """Write the voxels of ``region`` whose bit is set to ``survivors`` (n, 3), in order; return how many there are.
 
     Counting goes on past the end of ``survivors``, so that the caller can tell how many did not fit.
@@ -140,7 +138,7 @@ def list_passed(passed, region, survivors):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _pairs_with_any(words, first):  # type: ignore[no-untyped-def]
+def _pairs_with_any(words, first):
     """Return a bit for the first of each pair of :data:`LANES` words from ``first`` on: whether any bit is set."""
     if first + LANES > words.shape[0]:  # the last few: they are looked at in any case
         return lowest_bits(words.shape[0] - first) & FIRSTS

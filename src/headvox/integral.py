@@ -44,13 +44,13 @@ FIRST_HALF = np.uint32((1 << LANES // 2) - 1)
 
 
 @rule
-def place(z, half):  # type: ignore[no-untyped-def]
+def place(z, half):
     """Return where z lies in a column in halves, each ``half`` as long: first the even ones, then the odd ones."""
     return (z >> 1) + (z & 1) * half
 
 
 @bare_kernel
-def integrate(grids, shape, box, first, counting, row, S):  # type: ignore[no-untyped-def]
+def integrate(grids, shape, box, first, counting, row, S):
     """Fill ``S`` with the integral volume of the cells in ``box``, its columns in halves.
 
     ``grids`` (G, see :func:`room_for`) are the cells of a lattice of ``shape`` as several threads entered them, each
@@ -82,7 +82,7 @@ def integrate(grids, shape, box, first, counting, row, S):  # type: ignore[no-un
 
 
 @rule
-def _add_column(cells, at, grids, height, counting, row, bottom, half):  # type: ignore[no-untyped-def]
+def _add_column(cells, at, grids, height, counting, row, bottom, half):
     """Add to ``row``, from ``bottom`` on, what is in the column at ``at`` up to each of its cells."""
     lower, upper = place(bottom, half + LANES), place(bottom + 1, half + LANES)  # of the first two cells
     total = load(row, 0)
@@ -122,7 +122,7 @@ def row_for(length: int, sum_type: npt.DTypeLike) -> npt.NDArray[Any]:
 
 
 @rule
-def _sums_at(row, z, half):  # type: ignore[no-untyped-def]
+def _sums_at(row, z, half):
     """Return a vector of a column in halves from ``z`` on, of which ``row`` holds the halves apart."""
     if z + LANES <= half:
         return load(row, z)
@@ -132,7 +132,7 @@ def _sums_at(row, z, half):  # type: ignore[no-untyped-def]
 
 
 @rule
-def box_sum(S, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
+def box_sum(S, x0, x1, y0, y1, z0, z1):
     """Return the sum over the half-open box, cut off at the edges of ``S``."""
     nx, ny, nz = S.shape[0] - 1, S.shape[1] - 1, S.shape[2] - 1
     x0, x1 = min(max(x0, 0), nx), min(max(x1, 0), nx)
@@ -144,7 +144,7 @@ def box_sum(S, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
 
 
 @rule
-def sum_about(S, x, y, z, box):  # type: ignore[no-untyped-def]
+def sum_about(S, x, y, z, box):
     """Return the exact sum over ``box`` about the voxel x, y, z as a signed number."""
     value = box_sum(S, x + box[0], x + box[1], y + box[2], y + box[3], z + box[4], z + box[5])
     mask = 0xFFFF if S.itemsize == 2 else 0xFFFFFFFF
@@ -152,7 +152,7 @@ def sum_about(S, x, y, z, box):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def set_corners(S, boxes, corners):  # type: ignore[no-untyped-def]
+def set_corners(S, boxes, corners):
     """Write where the corners of ``boxes`` (B, 6) lie in the flat S, which is in halves, to (B, 8).
 
     First where the columns x1 y1, x0 y1, x1 y0 and x0 y0 begin, from that of the voxel that a box is about. Then where
@@ -198,7 +198,7 @@ def in_halves(S: Integral) -> Integral:
 
 
 @kernel
-def _box_sums(S, boxes, out):  # type: ignore[no-untyped-def]
+def _box_sums(S, boxes, out):
     mask = np.uint32(0xFFFF) if S.itemsize == 2 else np.uint32(0xFFFFFFFF)
     for i in range(boxes.shape[0]):
         b = boxes[i]

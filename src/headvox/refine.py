@@ -37,7 +37,7 @@ TRIANGLE, RIGHT, SQUARES, WEIGHTS, SUMS = 0, 10, 14, 15, 16
 
 
 @rule
-def part_at(a, b, c, part, voxel_m, part_m):  # type: ignore[no-untyped-def]
+def part_at(a, b, c, part, voxel_m, part_m):
     """Return where a part of the voxel ``a, b, c`` away lies, and whether it counts; metres from the voxel's centre."""
     px = (a - 0.5) * voxel_m + ((part >> 2 & 1) + 0.5) * part_m
     py = (b - 0.5) * voxel_m + ((part >> 1 & 1) + 0.5) * part_m
@@ -47,7 +47,7 @@ def part_at(a, b, c, part, voxel_m, part_m):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _gather(grids, shape, x, y, z, voxel_m, subdivision, counting, room):  # type: ignore[no-untyped-def]
+def _gather(grids, shape, x, y, z, voxel_m, subdivision, counting, room):
     """Write the parts near the voxel, in metres from its centre, to ``room``; return how many."""
     reach = int(np.ceil(REACH_M / voxel_m))
     part_m = voxel_m / subdivision
@@ -75,7 +75,7 @@ def _gather(grids, shape, x, y, z, voxel_m, subdivision, counting, room):  # typ
 
 
 @rule
-def add_priors(sphere, sums):  # type: ignore[no-untyped-def]
+def add_priors(sphere, sums):
     """Add to ``sums`` what is known of a head's place and size; ``sphere`` is x, y, z and the radius."""
     centre = SURFACE_SIGMA_M * SURFACE_SIGMA_M / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
     radius = SURFACE_SIGMA_M * SURFACE_SIGMA_M / (RADIUS_SIGMA_M * RADIUS_SIGMA_M)
@@ -89,7 +89,7 @@ def add_priors(sphere, sums):  # type: ignore[no-untyped-def]
 
 
 @rule
-def weigh_part(px, py, pz, sphere):  # type: ignore[no-untyped-def]
+def weigh_part(px, py, pz, sphere):
     """Return how a part's residual grows with the centre of ``sphere`` (x, y, z), the residual, and its weight."""
     dx, dy, dz = px - sphere[0], py - sphere[1], pz - sphere[2]
     distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
@@ -100,7 +100,7 @@ def weigh_part(px, py, pz, sphere):  # type: ignore[no-untyped-def]
 
 
 @rule
-def add_weighed(jx, jy, jz, residual, weight, sums):  # type: ignore[no-untyped-def]
+def add_weighed(jx, jy, jz, residual, weight, sums):
     """Add to ``sums`` what a part says of a sphere; for its numbers see :func:`weigh_part`."""
     j = (jx, jy, jz, -1.0)
     at = TRIANGLE
@@ -114,14 +114,14 @@ def add_weighed(jx, jy, jz, residual, weight, sums):  # type: ignore[no-untyped-
 
 
 @rule
-def add_part(px, py, pz, sphere, sums):  # type: ignore[no-untyped-def]
+def add_part(px, py, pz, sphere, sums):
     """Add to ``sums`` what a part says of ``sphere``."""
     jx, jy, jz, residual, weight = weigh_part(px, py, pz, sphere)
     add_weighed(jx, jy, jz, residual, weight, sums)
 
 
 @rule
-def take_step(sums, A, b, sphere):  # type: ignore[no-untyped-def]
+def take_step(sums, A, b, sphere):
     """Move ``sphere`` by what ``sums`` say, and return how far the parts lie from it (rms); A and b are scrap."""
     at = TRIANGLE
     for row in range(4):
@@ -137,7 +137,7 @@ def take_step(sums, A, b, sphere):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fit_spheres(grids, shape, peaks, voxel_m, subdivision, counting, room, spheres):  # type: ignore[no-untyped-def]
+def fit_spheres(grids, shape, peaks, voxel_m, subdivision, counting, room, spheres):
     """Fit a sphere about each of ``peaks`` (N, 3); write x, y, z (m, from the voxel's centre), radius, rms and count.
 
     ``grids`` are the cells of a lattice of ``shape``, see :func:`headvox.integral.integrate`. Gauss-Newton on the
@@ -163,7 +163,7 @@ def fit_spheres(grids, shape, peaks, voxel_m, subdivision, counting, room, spher
 
 
 @bare_kernel
-def _add_all(room, count, sums):  # type: ignore[no-untyped-def]
+def _add_all(room, count, sums):
     """Add to ``sums`` what each of ``count`` parts in ``room`` says: as :func:`add_weighed`, LANES parts at a time."""
     flat, length = room.reshape(-1), room.shape[1]
     none = fill(0.0)
@@ -183,7 +183,7 @@ def _add_all(room, count, sums):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def _weigh(room, count, sphere):  # type: ignore[no-untyped-def]
+def _weigh(room, count, sphere):
     """Write what :func:`weigh_part` returns for each of ``count`` parts to the rows of ``room`` behind their places."""
     # By itself, so that the compiler makes vectors of it: roots and quotients are slow.
     for k in range(np.uint64(count)):

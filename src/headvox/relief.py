@@ -32,7 +32,7 @@ STEEP = 1e-3  # sine of the angle between a ray and the vertical, from which on 
 
 
 @bare_kernel
-def set_places(spots, places):  # type: ignore[no-untyped-def]
+def set_places(spots, places):
     """Write the nine places about each spot to ``places`` (2, 9 W): metres to the right of the centre and above it.
 
     There are nine rows of W; lane 2 k of each is for spot k of ``spots`` (K, 2), the next lane for the one on the left.
@@ -47,7 +47,7 @@ def set_places(spots, places):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def find_pixels(middle, right, up, places, width, height, pixels, far):  # type: ignore[no-untyped-def]
+def find_pixels(middle, right, up, places, width, height, pixels, far):
     """Write the number of the pixel that sees each of ``places`` (2, P), -1 if none does, and how ``far`` it is (m).
 
     ``middle``, ``right`` and ``up`` (3,) are what the camera makes of the centre and of a metre either way.
@@ -64,7 +64,7 @@ def find_pixels(middle, right, up, places, width, height, pixels, far):  # type:
 
 
 @bare_kernel
-def compare(raw, scale, far, beyond):  # type: ignore[no-untyped-def]
+def compare(raw, scale, far, beyond):
     """Write how much farther than a place the surface is, along the camera's axis, in mm; UNKNOWN without a return."""
     for p in range(np.uint64(raw.shape[0])):
         mm = np.floor(1000.0 * (raw[p] * scale - far[p]) + 0.5)
@@ -72,7 +72,7 @@ def compare(raw, scale, far, beyond):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def take_medians(beyond, medians):  # type: ignore[no-untyped-def]
+def take_medians(beyond, medians):
     """Write the lower median of what is known in each lane of nine rows of ``beyond``; UNKNOWN of none.
 
     The rows are brought in order.
@@ -90,7 +90,7 @@ def take_medians(beyond, medians):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def look_closely(depth, scale, camera, origin, centres, spots, best, relief):  # type: ignore[no-untyped-def]
+def look_closely(depth, scale, camera, origin, centres, spots, best, relief):
     """Write what one camera measured about each of ``centres`` (N, 3), world, to ``relief`` (N, 2 K), mm.
 
     It does so where the camera sees more of a head than any before it: ``best`` (N,) says how much that was. ``camera``
@@ -141,7 +141,7 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):  #
 
 
 @kernel
-def add_trees(relief, best, nodes, roots, depths, most, gains):  # type: ignore[no-untyped-def]
+def add_trees(relief, best, nodes, roots, depths, most, gains):
     """Write what the trees say of each row of ``relief`` (N, 2 K) to ``gains`` (N,), at most ``most`` either way.
 
     Of what no camera saw (``best`` (N,) is 0) they say nothing.

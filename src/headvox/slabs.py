@@ -67,7 +67,7 @@ ONE_SLAB = np.empty(0, np.int64), 0
 
 
 @rule
-def slice_of(x, seams, overlap):  # type: ignore[no-untyped-def]
+def slice_of(x, seams, overlap):
     """Return where a voxel's slice ``x`` of the volume lies in its slabs."""
     at = np.int64(x)
     for seam in range(seams.shape[0]):

@@ -25,7 +25,7 @@ AROUND = {1: NEIGHBOURS[STEPS == 0], 2: NEIGHBOURS[STEPS <= 1], 4: NEIGHBOURS}
 
 
 @kernel
-def local_maxima(cells, scores, least, reach, index, peaks):  # type: ignore[no-untyped-def]
+def local_maxima(cells, scores, least, reach, index, peaks):
     """Write the indices of the local maxima to ``peaks``; return how many there are.
 
     A maximum scores more than all within ``reach`` voxels along each axis. ``index`` is a volume of zeros over all
@@ -59,7 +59,7 @@ def local_maxima(cells, scores, least, reach, index, peaks):  # type: ignore[no-
 
 
 @kernel
-def best_of_each(cells, scores, group, least, best):  # type: ignore[no-untyped-def]
+def best_of_each(cells, scores, group, least, best):
     """Write the index of the best of every ``group`` cells to ``best``; return how many there are.
 
     Of equals it is the first. Left out are those that score less than ``least`` and cells that were best before:
@@ -94,7 +94,7 @@ def suppress(cells: I32, scores: I64, least: int, shape: tuple[int, ...], reach:
 
 
 @kernel
-def _keep_apart(centres, scores, distance2, order, kept):  # type: ignore[no-untyped-def]
+def _keep_apart(centres, scores, distance2, order, kept):
     for i in range(order.shape[0]):  # best first: they are few
         k = i
         while k > 0 and scores[order[k - 1]] < scores[i]:

@@ -32,20 +32,20 @@ I32 = npt.NDArray[np.int32]
 
 
 @rule
-def project(camera, row, x, y, z):  # type: ignore[no-untyped-def]
+def project(camera, row, x, y, z):
     """Return what ``row`` of a camera's table gives for a place."""
     first = product(camera[row, 0], x) + product(camera[row, 1], y)
     return first + product(camera[row, 2], z) + camera[row, 3]
 
 
 @rule
-def floored(value):  # type: ignore[no-untyped-def]
+def floored(value):
     """Return the whole number at or below ``value``."""
     return int(np.floor(value))  # math.floor goes by way of float64
 
 
 @rule
-def pixel_of(camera, x, y, z):  # type: ignore[no-untyped-def]
+def pixel_of(camera, x, y, z):
     """Return column and row that see the centre of the cell x, y, z, and how far away it is (m): -1 if too near.
 
     ``camera`` is (4, 4) float32: rows that give u·Z, v·Z and Z (m) of a cell, and a row with the depth scale, the
@@ -61,7 +61,7 @@ def pixel_of(camera, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @rule
-def state_at(raw, camera, far):  # type: ignore[no-untyped-def]
+def state_at(raw, camera, far):
     """Return EMPTY, HIDDEN or 0 for a cell so ``far`` away whose pixel measured ``raw``."""
     measured = np.float32(raw) * camera[3, 0]
     margin = camera[3, 1] + product(camera[3, 2] * far, far)
@@ -71,7 +71,7 @@ def state_at(raw, camera, far):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def look_about(depth, camera, cells, offsets, states):  # type: ignore[no-untyped-def]
+def look_about(depth, camera, cells, offsets, states):
     """Merge what one camera saw of the cells about each candidate into ``states`` (candidates, M).
 
     ``offsets`` (3, M) lead from a candidate to its cells.
@@ -85,7 +85,7 @@ def look_about(depth, camera, cells, offsets, states):  # type: ignore[no-untype
 
 
 @bare_kernel
-def _find_pixels(camera, width, height, cell, offsets, pixels, far):  # type: ignore[no-untyped-def]
+def _find_pixels(camera, width, height, cell, offsets, pixels, far):
     """Write the number of the pixel that sees each of the cells about ``cell``, -1 if none, and how far it is (m)."""
     # By itself, as the other steps, so that the compiler makes vectors of it.
     for k in range(np.uint64(offsets.shape[1])):
@@ -96,20 +96,20 @@ def _find_pixels(camera, width, height, cell, offsets, pixels, far):  # type: ig
 
 
 @bare_kernel
-def read_pixels(flat, pixels, raw):  # type: ignore[no-untyped-def]
+def read_pixels(flat, pixels, raw):
     """Write what ``pixels`` of a flat image measured to ``raw``; 0 for a negative number, which is no pixel."""
     for k in range(np.uint64(pixels.shape[0])):
         raw[k] = flat[np.uint64(pixels[k])] if pixels[k] >= 0 else np.uint16(0)
 
 
 @bare_kernel
-def _merge(raw, camera, far, states):  # type: ignore[no-untyped-def]
+def _merge(raw, camera, far, states):
     for k in range(np.uint64(raw.shape[0])):
         states[k] = max(states[k], np.uint8(state_at(raw[k], camera, far[k])))
 
 
 @kernel
-def count_states(states, start, seen):  # type: ignore[no-untyped-def]
+def count_states(states, start, seen):
     """Count the EMPTY and the HIDDEN cells of each box: ``seen`` (candidates, boxes, 2)."""
     for i in range(states.shape[0]):
         for b in range(seen.shape[1]):
@@ -123,7 +123,7 @@ def count_states(states, start, seen):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def look_at_places(depth, camera, fx, fy, scale, places, sight_m, states):  # type: ignore[no-untyped-def]
+def look_at_places(depth, camera, fx, fy, scale, places, sight_m, states):
     """Raise ``states`` (N,) to what one camera saw of each of ``places`` (N, 3), a head's size about each.
 
     ``camera`` is (3, 4) float64: rows that give u·Z, v·Z and Z of a world point. Nine pixels of a grid about the place

@@ -32,7 +32,7 @@ F64 = npt.NDArray[np.float64]
 
 
 @rule
-def sum_in_halves(S, x, y, z, box):  # type: ignore[no-untyped-def]
+def sum_in_halves(S, x, y, z, box):
     """Return the exact sum over ``box`` about the voxel x, y, z as a signed number; S, which holds it, is in halves."""
     half = S.shape[2] // 2
     x0, x1, y0, y1 = x + box[0], x + box[1], y + box[2], y + box[3]
@@ -47,7 +47,7 @@ def sum_in_halves(S, x, y, z, box):  # type: ignore[no-untyped-def]
 
 
 @rule
-def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes):  # type: ignore[no-untyped-def]
+def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes):
     """Return the score of the voxel x, y, z, and its best yaw or -1: see :func:`score_by_votes`."""
     best = -np.inf
     best_yaw = -1
@@ -78,7 +78,7 @@ def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes): 
 
 
 @kernel
-def vote_masks(  # type: ignore[no-untyped-def]
+def vote_masks(
     S, seams, overlap, cells, first, last, boxes, weights, start, masks, pairs, cost, min_votes, scores, best_yaw,
 ):  # fmt: skip
     """Score the candidates ``first`` to ``last`` of ``cells``: see :func:`score_by_votes`.
@@ -119,7 +119,7 @@ def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, 
 
 
 @bare_kernel
-def rank(sums, count):  # type: ignore[no-untyped-def]
+def rank(sums, count):
     """Bring the three smallest of ``count`` rows to the first rows and the three largest to the last, lane by lane."""
     for i in range(min(3, count - 1)):
         for j in range(i + 1, count):
@@ -130,7 +130,7 @@ def rank(sums, count):  # type: ignore[no-untyped-def]
 
 
 @rule
-def order(sums, one, other):  # type: ignore[no-untyped-def]
+def order(sums, one, other):
     """Exchange two rows where the first is larger, lane by lane."""
     a, b = load(sums, one), load(sums, other)
     store(sums, one, smaller(a, b))
@@ -138,7 +138,7 @@ def order(sums, one, other):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def statistics_of(sums, count, ranked, features, first):  # type: ignore[no-untyped-def]
+def statistics_of(sums, count, ranked, features, first):
     """Write the statistics of ``count`` rows of ``sums`` to the rows of ``features`` from ``first`` on."""
     total = load(sums, 0)
     for i in range(1, count):
@@ -153,7 +153,7 @@ def statistics_of(sums, count, ranked, features, first):  # type: ignore[no-unty
 
 
 @bare_kernel
-def _add_trees(first, last, leaf_start, leaves, node_start, nodes, cuts, features, values, total):  # type: ignore[no-untyped-def]
+def _add_trees(first, last, leaf_start, leaves, node_start, nodes, cuts, features, values, total):
     """Write the sum of the leaves that the trees ``first`` to ``last`` lead to, to ``total`` (LANES,).
 
     From the leaves down to the root, every node takes the value of its one branch or of the other: no step depends on
@@ -175,7 +175,7 @@ def _add_trees(first, last, leaf_start, leaves, node_start, nodes, cuts, feature
 
 
 @bare_kernel
-def _look_up(flat, at, is_odd, width, corners, first, count, sums):  # type: ignore[no-untyped-def]
+def _look_up(flat, at, is_odd, width, corners, first, count, sums):
     """Write the sums over ``count`` boxes from ``first`` on to as many rows of ``sums``, a lane a candidate.
 
     ``at`` and ``is_odd`` say where a candidate is: see :func:`headvox.integral.set_corners`.
@@ -197,7 +197,7 @@ def _look_up(flat, at, is_odd, width, corners, first, count, sums):  # type: ign
 
 
 @bare_kernel
-def vote_stages(  # type: ignore[no-untyped-def]
+def vote_stages(
     S, seams, overlap, cells, seen, first, last, from_stage, to_stage, group_start, group_channel, seen_start,
     used_start, used, leaf_start, leaves, node_start, nodes, cuts, stage_trees, stage_keep, corners, alive, at, is_odd,
     sums, features, values, total, scores,

@@ -137,20 +137,20 @@ def new_box() -> I64:
 
 
 @rule
-def moved(T, axis, x, y, z):  # type: ignore[no-untyped-def]
+def moved(T, axis, x, y, z):
     """Return where ``T`` (4, 4) takes places, along an axis."""
     turned = add(mul(fill(T[axis, 0]), x), mul(fill(T[axis, 1]), y))
     return add(fill(T[axis, 3]), add(turned, mul(fill(T[axis, 2]), z)))
 
 
 @rule
-def along_ray(t, far, column, row):  # type: ignore[no-untyped-def]
+def along_ray(t, far, column, row):
     """Return where pixels with these depths are, along an axis: see :class:`Rays`."""
     return add(fill(t), mul(far, add(column, fill(row))))
 
 
 @rule
-def inside(x, y, z, limits):  # type: ignore[no-untyped-def]
+def inside(x, y, z, limits):
     """Return a bit for each place, in parts from the origin: whether it is within the region, and not NaN."""
     dx, dy, dz = sub(x, fill(limits[0])), sub(y, fill(limits[1])), sub(z, fill(limits[2]))
     distance = add(add(mul(dx, dx), mul(dy, dy)), mul(dz, dz))
@@ -158,7 +158,7 @@ def inside(x, y, z, limits):  # type: ignore[no-untyped-def]
 
 
 @rule
-def code_of(x, y, z, ny, nz, shift):  # type: ignore[no-untyped-def]
+def code_of(x, y, z, ny, nz, shift):
     """Return cell * 8 + part of places inside, given in whole parts."""
     cell = add(times(add(times(shift_right(x, shift), ny), shift_right(y, shift)), nz), shift_right(z, shift))
     one = fill(shift)
@@ -167,7 +167,7 @@ def code_of(x, y, z, ny, nz, shift):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _mark(x, y, z, known, left, codes, at, limits, bits, counting, new, count):  # type: ignore[no-untyped-def]
+def _mark(x, y, z, known, left, codes, at, limits, bits, counting, new, count):
     """Write the packed parts of LANES places, in parts from the origin, to ``new`` from ``count`` on.
 
     Left out are places whose bit in ``known`` is not set, and such as repeat others. ``left`` are the parts of the
@@ -187,13 +187,13 @@ def _mark(x, y, z, known, left, codes, at, limits, bits, counting, new, count): 
 
 
 @rule
-def packed(x, y, z, bits):  # type: ignore[no-untyped-def]
+def packed(x, y, z, bits):
     """Return whole parts x, y, z as one number; see :attr:`Lattice.bits`."""
     return add(shift_left(add(shift_left(x, bits[0]), y), bits[1]), z)
 
 
 @bare_kernel
-def enter(new, count, bits, shape, shift, counting, box, codes, cells):  # type: ignore[no-untyped-def]
+def enter(new, count, bits, shape, shift, counting, box, codes, cells):
     """Enter ``count`` packed parts into the flat grid ``cells``, and widen ``box``, see :func:`new_box`.
 
     ``new`` has room for LANES more; ``codes`` (LANES,) is working memory.
@@ -231,7 +231,7 @@ def enter(new, count, bits, shape, shift, counting, box, codes, cells):  # type:
 
 
 @bare_kernel
-def mark_points(  # type: ignore[no-untyped-def]
+def mark_points(
     points, blocks, T, limits, bits, shape, shift, counting, codes, new, few, few_codes, box, cells
 ):
     """Enter ``points`` (N, 3) into the flat grid ``cells``, and widen ``box``, see :func:`new_box`.
@@ -262,7 +262,7 @@ def mark_points(  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def mark_depth(  # type: ignore[no-untyped-def]
+def mark_depth(
     depth,
     blocks,
     column,
@@ -312,7 +312,7 @@ def mark_depth(  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def join_boxes(boxes):  # type: ignore[no-untyped-def]
+def join_boxes(boxes):
     """Widen the first of ``boxes`` (N, 6) by the others."""
     for box in range(1, boxes.shape[0]):
         for k in range(3):
@@ -321,7 +321,7 @@ def join_boxes(boxes):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def empty(cells):  # type: ignore[no-untyped-def]
+def empty(cells):
     """Clear a flat grid."""
     cells[:] = 0
 

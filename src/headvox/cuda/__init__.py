@@ -5,5 +5,5 @@ What is fitted to the peaks, spheres and poses, is the same within a tolerance: 
 One module a stage, as on the CPU, and the same scalar rules: :mod:`headvox.cuda.lanes` compiles the Python functions
 of the CPU's rules for the device. Nothing here is imported unless a detector is told to use it.
 
-As on the CPU, kernels and rules have no type hints, and say so to the type checker: see :mod:`headvox.machine.kernels`.
+As on the CPU, kernels and rules have no type hints: see :mod:`headvox.machine.kernels`.
 """

@@ -6,7 +6,7 @@ from headvox.cuda.lanes import device, wait_for_block
 
 
 @device
-def sum_of_all(totals, thread, threads):  # type: ignore[no-untyped-def]
+def sum_of_all(totals, thread, threads):
     """Return the sum of ``totals`` (threads,), shared by a block whose threads, a power of two, all call this."""
     wait_for_block()
     step = threads // 2
@@ -21,7 +21,7 @@ def sum_of_all(totals, thread, threads):  # type: ignore[no-untyped-def]
 
 
 @device
-def sum_rows(rows, thread, threads):  # type: ignore[no-untyped-def]
+def sum_rows(rows, thread, threads):
     """Leave the sum of ``rows`` (threads, N), shared by a block whose threads all call this, in the first of them."""
     wait_for_block()
     step = threads // 2
@@ -34,6 +34,6 @@ def sum_rows(rows, thread, threads):  # type: ignore[no-untyped-def]
 
 
 @device
-def share_of(count, thread, threads):  # type: ignore[no-untyped-def]
+def share_of(count, thread, threads):
     """Return the half-open range of ``count`` things that a thread does."""
     return count * thread // threads, count * (thread + 1) // threads

@@ -14,7 +14,7 @@ THREADS = 256  # that add up the counts of all shares
 
 
 @kernel
-def count_bits(bits, counts):  # type: ignore[no-untyped-def]
+def count_bits(bits, counts):
     """Write to ``counts`` (frames, shares) how many bits are set in each share of ``bits`` (frames, words)."""
     frame, shares = cuda.blockIdx.y, counts.shape[1]
     each = (bits.shape[1] + shares - 1) // shares
@@ -26,7 +26,7 @@ def count_bits(bits, counts):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_up(counts, total, which):  # type: ignore[no-untyped-def]
+def add_up(counts, total, which):
     """Replace ``counts`` (frames, shares) by the sums of those before each; write the whole to ``total[:, which]``.
 
     One block a frame.
@@ -52,7 +52,7 @@ def add_up(counts, total, which):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def list_bits(bits, before, listed):  # type: ignore[no-untyped-def]
+def list_bits(bits, before, listed):
     """Write the numbers of the bits that are set to ``listed`` (frames, N), in order, as far as they fit.
 
     ``before`` (frames, shares) tells how many are set before each share, see :func:`count_bits`.

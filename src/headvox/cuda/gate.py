@@ -15,7 +15,7 @@ from headvox.gate import holds
 
 
 @device
-def _sum_at(S, at, boxes, b):  # type: ignore[no-untyped-def]
+def _sum_at(S, at, boxes, b):
     return sum_about_voxel(S, at[0], at[1], at[2], boxes[b])
 
 
@@ -23,7 +23,7 @@ _holds = on_device(holds, **LANE_WISE, box_sums_at=_sum_at)
 
 
 @device
-def is_candidate(x, y, z, spacing):  # type: ignore[no-untyped-def]
+def is_candidate(x, y, z, spacing):
     """Return whether a gate of this spacing looks at the voxel x, y, z, counted from the world's origin."""
     if spacing == 2:
         return (x + y + z) & 1 == 0
@@ -31,7 +31,7 @@ def is_candidate(x, y, z, spacing):  # type: ignore[no-untyped-def]
 
 
 @device
-def cell_of(place, S):  # type: ignore[no-untyped-def]
+def cell_of(place, S):
     """Return x, y, z of a place; ``S`` is the integral volume (nx + 1, ny + 1, nz + 1)."""
     columns, length = S.shape[1] + 1, S.shape[2] + 1
     column = place // length
@@ -39,7 +39,7 @@ def cell_of(place, S):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def gate(S, whole, boxes, weights, spans, rank, limits, spacing, passed):  # type: ignore[no-untyped-def]
+def gate(S, whole, boxes, weights, spans, rank, limits, spacing, passed):
     """Set the bit in ``passed`` (frames, words), which is cleared, of each place that passes all conditions."""
     frame = cuda.blockIdx.y
     volume = S[frame]

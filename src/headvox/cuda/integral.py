@@ -12,7 +12,7 @@ from headvox.cuda.lanes import device, kernel
 
 
 @device
-def amount_in(cells, cell, counting):  # type: ignore[no-untyped-def]
+def amount_in(cells, cell, counting):
     """Return what a cell of a grid, a row of words, adds to a sum."""
     if counting:
         return np.int64(cells[cell])
@@ -20,7 +20,7 @@ def amount_in(cells, cell, counting):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sum_along_z(cells, counting, S):  # type: ignore[no-untyped-def]
+def sum_along_z(cells, counting, S):
     """Write to each column of ``S`` (frames, nx + 1, ny + 1, nz + 1) the sums up its own column of cells."""
     frame = cuda.blockIdx.y
     columns, length = S.shape[2], S.shape[3]
@@ -36,7 +36,7 @@ def sum_along_z(cells, counting, S):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sum_along(S):  # type: ignore[no-untyped-def]
+def sum_along(S):
     """Add to each entry of ``S`` (frames, A, N, B) all before it along the third axis."""
     frame, length = cuda.blockIdx.y, S.shape[3]
     for i in range(cuda.grid(1), S.shape[1] * length, cuda.gridsize(1)):

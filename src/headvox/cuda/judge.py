@@ -38,7 +38,7 @@ POSE = 29
 
 
 @kernel
-def keep_best(counts, steps, about_scores, peaks, peak_places, best, judged, judged_places, judged_scores):  # type: ignore[no-untyped-def]
+def keep_best(counts, steps, about_scores, peaks, peak_places, best, judged, judged_places, judged_scores):
     """Move each peak to the best voxel about it; of those that meet, and those that were dropped, keep the first.
 
     ``about_scores`` (frames, most * len(steps)) are of the voxels ``steps`` from each of the ``peak_places``; ``best``
@@ -73,7 +73,7 @@ def keep_best(counts, steps, about_scores, peaks, peak_places, best, judged, jud
 
 
 @kernel
-def look_about(S, whole, quads, half, counts, judged_places, offsets, states):  # type: ignore[no-untyped-def]
+def look_about(S, whole, quads, half, counts, judged_places, offsets, states):
     """Write what the cameras saw of the cells about each judged peak to ``states`` (frames, most, offsets)."""
     frame, cells = cuda.blockIdx.y, offsets.shape[0]
     if whole[frame, SEES] == 0:
@@ -104,7 +104,7 @@ def look_about(S, whole, quads, half, counts, judged_places, offsets, states):  
 
 
 @kernel
-def count_states(whole, counts, states, start, seen):  # type: ignore[no-untyped-def]
+def count_states(whole, counts, states, start, seen):
     """Count the EMPTY and the HIDDEN cells of each box about each judged peak: ``seen`` (frames, most, boxes, 2)."""
     frame, boxes = cuda.blockIdx.y, seen.shape[2]
     if whole[frame, SEES] == 0:
@@ -121,7 +121,7 @@ def count_states(whole, counts, states, start, seen):  # type: ignore[no-untyped
 
 
 @kernel
-def report(  # type: ignore[no-untyped-def]
+def report(
     S, counts, judged, judged_places, judged_scores, yaws, kept, heads, spheres, poses, has_poses, rows, real
 ):
     """Write a frame's report to ``rows`` (frames, N), which ``real`` is as float64; a thread a head.

@@ -61,85 +61,85 @@ MATH = _math()
 
 
 @device
-def fill(value):  # type: ignore[no-untyped-def]
+def fill(value):
     """Return ``value``."""
     return value
 
 
 @device
-def load(flat, at):  # type: ignore[no-untyped-def]
+def load(flat, at):
     """Return the item of ``flat`` at ``at``."""
     return flat[at]
 
 
 @device
-def store(flat, at, value):  # type: ignore[no-untyped-def]
+def store(flat, at, value):
     """Set the item of ``flat`` at ``at``."""
     flat[at] = value
 
 
 @device
-def add(a, b):  # type: ignore[no-untyped-def]
+def add(a, b):
     """Return a + b."""
     return a + b
 
 
 @device
-def sub(a, b):  # type: ignore[no-untyped-def]
+def sub(a, b):
     """Return a - b."""
     return a - b
 
 
 @device
-def times(a, factor):  # type: ignore[no-untyped-def]
+def times(a, factor):
     """Return a * factor, of whole numbers."""
     return a * factor
 
 
 @device
-def bit_and(a, b):  # type: ignore[no-untyped-def]
+def bit_and(a, b):
     """Return a & b."""
     return a & b
 
 
 @device
-def shift_right(a, count):  # type: ignore[no-untyped-def]
+def shift_right(a, count):
     """Return a >> count."""
     return a >> count
 
 
 @device
-def below(a, b):  # type: ignore[no-untyped-def]
+def below(a, b):
     """Return 1 if a < b, else 0."""
     return 1 if a < b else 0
 
 
 @device
-def less(a, b):  # type: ignore[no-untyped-def]
+def less(a, b):
     """Return 1 if a < b, else 0."""
     return 1 if a < b else 0
 
 
 @device
-def within(a, low, high):  # type: ignore[no-untyped-def]
+def within(a, low, high):
     """Return 1 if low <= a <= high, else 0."""
     return 1 if np.int64(low) <= a <= np.int64(high) else 0
 
 
 @device
-def floored(value):  # type: ignore[no-untyped-def]
+def floored(value):
     """Return the whole number at or below ``value``: NumPy's floor is not there on the device."""
     return np.int64(math.floor(value))
 
 
 @device
-def smaller(a, b):  # type: ignore[no-untyped-def]
+def smaller(a, b):
     """Return the smaller of two."""
     return min(a, b)
 
 
 @device
-def larger(a, b):  # type: ignore[no-untyped-def]
+def larger(a, b):
     """Return the larger of two."""
     return max(a, b)
 
@@ -151,7 +151,8 @@ if SIMULATED:
         thread: Any = threading.current_thread()
         thread.syncthreads()
 
-    def mul(a, b):  # type: ignore[no-untyped-def]
+    @device
+    def mul(a, b):
         """Return a * b."""
         return a * b
 
@@ -163,12 +164,12 @@ else:
 
     # A product that is rounded, whatever it is added to: the compiler may not contract it to a fused operation.
     @device
-    def product_32(a, b):  # type: ignore[no-untyped-def]
+    def product_32(a, b):
         """Return a * b of two float32, rounded."""
         return libdevice.fmul_rn(a, b)
 
     @device
-    def product_64(a, b):  # type: ignore[no-untyped-def]
+    def product_64(a, b):
         """Return a * b of two float64, rounded."""
         return libdevice.dmul_rn(a, b)
 

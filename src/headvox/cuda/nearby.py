@@ -77,7 +77,7 @@ _expect_turns = on_device(expect_turns, np=MATH)
 
 
 @device
-def first_of_round(k, room):  # type: ignore[no-untyped-def]
+def first_of_round(k, room):
     """Return the number, from 1, of the reading at which a list with so much room is thinned for the k-th time."""
     first = room + 1
     for done in range(1, k):
@@ -86,7 +86,7 @@ def first_of_round(k, room):  # type: ignore[no-untyped-def]
 
 
 @device
-def place_of(number, there, room):  # type: ignore[no-untyped-def]
+def place_of(number, there, room):
     """Return where the reading of this ``number``, from 1, of all that are ``there`` is kept; -1 where it is not.
 
     A list with ``room`` for so many is thinned whenever it is full, and from then on takes every second of what it took
@@ -111,7 +111,7 @@ def place_of(number, there, room):  # type: ignore[no-untyped-def]
 
 
 @device
-def length_of(there, room):  # type: ignore[no-untyped-def]
+def length_of(there, room):
     """Return how many of ``there`` readings are in such a list in the end."""
     rounds = 0
     while first_of_round(rounds + 1, room) <= there:
@@ -122,7 +122,7 @@ def length_of(there, room):  # type: ignore[no-untyped-def]
 
 
 @device
-def shift_to(wide, at, centre, T):  # type: ignore[no-untyped-def]
+def shift_to(wide, at, centre, T):
     """Write to ``T`` (3, 4) what maps a sensor's coordinates to those from ``centre`` (3,)."""
     for i in range(3):
         for j in range(4):
@@ -131,7 +131,7 @@ def shift_to(wide, at, centre, T):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def gather(  # type: ignore[no-untyped-def]
+def gather(
     whole, wide, real, half, octets, counts, heads, spheres, samples, rays, near, points, passing, turns
 ):
     """Fill ``samples`` (frames * heads, S, SAMPLE) and ``rays`` (frames * heads, R, RAY) with what is near each head.
@@ -248,7 +248,7 @@ def gather(  # type: ignore[no-untyped-def]
 
 
 @device
-def copy_evenly(source, there, most, target, first):  # type: ignore[no-untyped-def]
+def copy_evenly(source, there, most, target, first):
     """Copy at most ``most`` of the rows that are ``there`` to those of ``target`` from ``first`` on."""
     used = min(there, most)
     for s in range(cuda.threadIdx.x, used, cuda.blockDim.x):

@@ -84,7 +84,7 @@ class Starts(NamedTuple):
 
 
 @device
-def factor(A, size, thread, threads):  # type: ignore[no-untyped-def]
+def factor(A, size, thread, threads):
     """Leave the Cholesky factor in the lower half of A, and what solves L x = -(column RESIDUAL) in its last row.
 
     All threads of a block call this: as :func:`headvox.pose.align.solve`, a column at a time.
@@ -107,7 +107,7 @@ def factor(A, size, thread, threads):  # type: ignore[no-untyped-def]
 
 
 @device
-def solve_back(A, size, x):  # type: ignore[no-untyped-def]
+def solve_back(A, size, x):
     """Write the step to ``x``, and return half the logarithm of the determinant."""
     half_log_det = 0.0
     for i in range(size - 1, -1, -1):
@@ -120,7 +120,7 @@ def solve_back(A, size, x):  # type: ignore[no-untyped-def]
 
 
 @device
-def accumulate(J, count, size, A, thread, threads):  # type: ignore[no-untyped-def]
+def accumulate(J, count, size, A, thread, threads):
     """Set the upper half of A to J W Jᵀ over ``count`` columns, and its last column to J W e: an entry a thread."""
     entries = size * (size + 1) // 2 + size
     for entry in range(thread, entries, threads):
@@ -137,7 +137,7 @@ def accumulate(J, count, size, A, thread, threads):  # type: ignore[no-untyped-d
 
 
 @device
-def linearise(  # type: ignore[no-untyped-def]
+def linearise(
     points, first, n, rays, m, modes, k, upright, template, state, J, A, told, costs, thread, threads
 ):
     """As :func:`headvox.pose.align.linearise`, by all threads of a block, of ``n`` points from the ``first`` on."""
@@ -161,7 +161,7 @@ def linearise(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, scratch, starts):  # type: ignore[no-untyped-def]
+def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, scratch, starts):
     """Fit each start of each head: coarsely, but for the expected one, then to the end. ``scratch`` has a J a block."""
     told = cuda.shared.array((MOST_THREADS, TOLD), np.float64)
     costs = cuda.shared.array((MOST_THREADS, 1), np.float64)
@@ -231,7 +231,7 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
 
 
 @device
-def choose_refined(costs, coarse, fine, told, points, count, picked, refined):  # type: ignore[no-untyped-def]
+def choose_refined(costs, coarse, fine, told, points, count, picked, refined):
     """Copy what :func:`headvox.pose.trials.search` would refine of ``count`` starts to ``refined``; return how many.
 
     ``points`` is how many they were fitted to. All starts are refined; the first is what is expected, if anything is.
@@ -260,7 +260,7 @@ def choose_refined(costs, coarse, fine, told, points, count, picked, refined):  
 
 
 @device
-def take(fine, told, start, refined, at):  # type: ignore[no-untyped-def]
+def take(fine, told, start, refined, at):
     """Copy what a start came to to the row ``at`` of ``refined``."""
     for j in range(STATE):
         refined.states[at, j] = fine[start, j]
@@ -279,7 +279,7 @@ _best_of = on_device(best_of, np=MATH)
 
 
 @kernel
-def settle_heads(  # type: ignore[no-untyped-def]
+def settle_heads(
     counts,
     near,
     heads,
@@ -352,7 +352,7 @@ def settle_heads(  # type: ignore[no-untyped-def]
 
 
 @device
-def clear_pose(poses, i, centre):  # type: ignore[no-untyped-def]
+def clear_pose(poses, i, centre):
     """Say of head ``i`` that nothing is known but its ``centre``."""
     poses.radii[i] = poses.misfits[i] = poses.coverages[i] = poses.crossings[i] = MATH.nan
     for k in range(4):

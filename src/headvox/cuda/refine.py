@@ -42,19 +42,19 @@ _take_step = on_device(
 
 
 @device
-def joined(low, high):  # type: ignore[no-untyped-def]
+def joined(low, high):
     """Return the int64 that two int32 are the halves of."""
     return (np.int64(high) << np.int64(32)) | (np.int64(low) & np.int64(0xFFFFFFFF))
 
 
 @device
-def centre_of(place, S, origin, voxel_m, axis):  # type: ignore[no-untyped-def]
+def centre_of(place, S, origin, voxel_m, axis):
     """Return a coordinate of the centre of the voxel at ``place``, world, metres: as the CPU has it."""
     return product_64(cell_of(place, S)[axis] + 0.5, voxel_m) + origin[axis]
 
 
 @kernel
-def keep(S, whole, wide, octets, counts, places, scores, voxel_m, kept):  # type: ignore[no-untyped-def]
+def keep(S, whole, wide, octets, counts, places, scores, voxel_m, kept):
     """List in ``kept`` (frames, most) which of the judged peaks are heads: see :func:`headvox.keep.keep`.
 
     ``wide`` (frames, N) is the uploaded row as float64, and ``octets`` (frames, N, 8) the same in eights. One thread a
@@ -85,7 +85,7 @@ def keep(S, whole, wide, octets, counts, places, scores, voxel_m, kept):  # type
 
 
 @kernel
-def fit_spheres(  # type: ignore[no-untyped-def]
+def fit_spheres(
     S, whole, wide, cells, counts, places, kept, reach, voxel_m, subdivision, counting, fits, spheres
 ):
     """Write to ``spheres`` (frames, most, 4) the centre, world, and the radius of each kept peak's sphere.
@@ -143,7 +143,7 @@ def fit_spheres(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def suppress_overlaps(counts, scores, kept, spheres, distance_m, order, heads):  # type: ignore[no-untyped-def]
+def suppress_overlaps(counts, scores, kept, spheres, distance_m, order, heads):
     """List in ``heads`` (frames, most) which of the kept are no closer than ``distance_m`` to a better one, best first.
 
     ``order`` is working memory. One block a frame: see :func:`headvox.suppress.suppress_overlaps`.

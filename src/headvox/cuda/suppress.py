@@ -13,7 +13,7 @@ CANDIDATES, MAXIMA, PEAKS, JUDGED, KEPT, HEADS = range(6)
 
 
 @device
-def first_not_below(places, count, place):  # type: ignore[no-untyped-def]
+def first_not_below(places, count, place):
     """Return the index of the first of ``count`` rising ``places`` that is at least ``place``."""
     low, high = 0, count
     while low < high:
@@ -26,7 +26,7 @@ def first_not_below(places, count, place):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def mark_maxima(places, counts, scores, reach, column, layer, marked):  # type: ignore[no-untyped-def]
+def mark_maxima(places, counts, scores, reach, column, layer, marked):
     """Set the bit in ``marked`` (frames, words) of each candidate that beats all within ``reach`` voxels.
 
     Those that were dropped are none; of equal ones the first wins. ``places`` (frames, N) rise; a step in y is
@@ -51,7 +51,7 @@ def mark_maxima(places, counts, scores, reach, column, layer, marked):  # type: 
 
 
 @kernel
-def rank_maxima(maxima, counts, scores, most, ranks):  # type: ignore[no-untyped-def]
+def rank_maxima(maxima, counts, scores, most, ranks):
     """Write how many of the ``maxima`` (frames, N; numbers of candidates) come before each, best score first.
 
     Of equal scores the first comes first. Where there are no more than ``most``, it does not matter: 0.
@@ -68,7 +68,7 @@ def rank_maxima(maxima, counts, scores, most, ranks):  # type: ignore[no-untyped
 
 
 @kernel
-def list_peaks(maxima, counts, ranks, places, scores, peaks, peak_places, peak_scores):  # type: ignore[no-untyped-def]
+def list_peaks(maxima, counts, ranks, places, scores, peaks, peak_places, peak_scores):
     """Write the best of the maxima, as many as fit (frames, most), in the order of the volume."""
     frame, most = cuda.blockIdx.y, peaks.shape[1]
     count = min(counts[frame, MAXIMA], maxima.shape[1])

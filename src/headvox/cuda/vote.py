@@ -29,7 +29,7 @@ _votes_at = on_device(votes_at, sum_in_halves=sum_about_voxel, product=product_6
 
 
 @kernel
-def vote_masks(S, places, counts, which, table, masks, cost, min_votes, scores, yaws):  # type: ignore[no-untyped-def]
+def vote_masks(S, places, counts, which, table, masks, cost, min_votes, scores, yaws):
     """Write the votes for each candidate, and its best yaw: see :func:`headvox.vote.score_by_votes`.
 
     ``places`` (frames, N) are the candidates, ``counts[:, which]`` of them in each frame; ``table`` is that of
@@ -51,7 +51,7 @@ def votes_table(votes: CompiledVotes) -> tuple[npt.NDArray[Any], ...]:
 
 
 @device
-def leaf_of(tree, root, depth, nodes, features):  # type: ignore[no-untyped-def]
+def leaf_of(tree, root, depth, nodes, features):
     """Return the leaf that a tree leads to, see :class:`headvox.masks.compile.CompiledStages`."""
     at = root[tree]
     for _ in range(depth[tree]):
@@ -60,7 +60,7 @@ def leaf_of(tree, root, depth, nodes, features):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def vote_stages(S, whole, places, steps, counts, which, table, seen, sees, to_stage, sums, features, scores):  # type: ignore[no-untyped-def]
+def vote_stages(S, whole, places, steps, counts, which, table, seen, sees, to_stage, sums, features, scores):
     """Write the scores of the first ``to_stage`` stages to ``scores`` (frames, N): DROPPED where a stage says so.
 
     Candidate i is ``steps[i % len(steps)]`` from the place ``places[:, i // len(steps)]``; ``counts[:, which]`` places

@@ -35,7 +35,7 @@ _code_of = on_device(code_of, **LANE_WISE)
 
 
 @kernel
-def clear(cells, passed, marked, counts):  # type: ignore[no-untyped-def]
+def clear(cells, passed, marked, counts):
     """Set all four (frames, N each) to 0."""
     frame = cuda.blockIdx.y
     for words in (cells, passed, marked):
@@ -46,7 +46,7 @@ def clear(cells, passed, marked, counts):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def mark(whole, real, quads, half, shape, shift, counting, cells):  # type: ignore[no-untyped-def]
+def mark(whole, real, quads, half, shape, shift, counting, cells):
     """Enter the readings of each frame into its grid ``cells`` (frames, words); z of the launch is the sensor.
 
     ``whole``, ``real`` and ``half`` are the same buffer as int32, float32 and uint16, and ``quads`` (frames, N, 4) as

@@ -166,7 +166,7 @@ GATE = Bank.of([replace(group, name=group.name) for group in GATE_GROUPS])
 
 
 @kernel
-def _box_sums(S, cells, boxes, out):  # type: ignore[no-untyped-def]
+def _box_sums(S, cells, boxes, out):
     for i in range(cells.shape[0]):
         for b in range(boxes.shape[0]):
             out[i, b] = sum_about(S, cells[i, 0], cells[i, 1], cells[i, 2], boxes[b])

@@ -10,7 +10,7 @@ LEAST_PIVOT = 1e-12
 
 
 @rule
-def factor(A, size):  # type: ignore[no-untyped-def]
+def factor(A, size):
     """Leave L in the lower half of A (size, >= size), whose upper half is read; return half the log determinant."""
     half_log_det = 0.0
     for i in range(size):
@@ -28,7 +28,7 @@ def factor(A, size):  # type: ignore[no-untyped-def]
 
 
 @rule
-def substitute(A, x, size):  # type: ignore[no-untyped-def]
+def substitute(A, x, size):
     """Replace ``x`` (size,) by what solves L Lᵀ y = x, L the lower half of A: forward, then back substitution."""
     for i in range(size):
         for q in range(i):

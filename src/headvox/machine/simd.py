@@ -39,20 +39,20 @@ class _LanesModel(models.PrimitiveModel):
 
 
 @intrinsic
-def load(typingctx, flat, at):  # type: ignore[no-untyped-def]
+def load(typingctx, flat, at):
     """Return ``flat[at : at + LANES]`` of a C-contiguous array."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.load(_pointer(context, builder, signature, arguments), align=_size(flat.dtype))
 
     return Lanes(flat.dtype)(flat, at), emit
 
 
 @intrinsic
-def store(typingctx, flat, at, lanes):  # type: ignore[no-untyped-def]
+def store(typingctx, flat, at, lanes):
     """Set ``flat[at : at + LANES]`` of a C-contiguous array."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         pointer = _pointer(context, builder, signature, arguments)
         builder.store(arguments[2], pointer, align=_size(flat.dtype))
         return context.get_dummy_value()
@@ -61,21 +61,21 @@ def store(typingctx, flat, at, lanes):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def fill(typingctx, value):  # type: ignore[no-untyped-def]
+def fill(typingctx, value):
     """Return ``value`` in every lane, in its own type."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return _spread(builder, arguments[0])
 
     return Lanes(value)(value), emit
 
 
 @intrinsic
-def load_triples(typingctx, flat, at):  # type: ignore[no-untyped-def]
+def load_triples(typingctx, flat, at):
     """Return three vectors: every third item of ``flat`` from ``at``, ``at + 1`` and ``at + 2`` on."""
     lanes = Lanes(flat.dtype)
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         scalar = context.get_value_type(flat.dtype)
         pointer = _pointer(context, builder, signature, arguments)
         pointer = builder.bitcast(pointer, ir.VectorType(scalar, 3 * LANES).as_pointer())
@@ -90,11 +90,11 @@ def load_triples(typingctx, flat, at):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def load_pairs(typingctx, flat, at):  # type: ignore[no-untyped-def]
+def load_pairs(typingctx, flat, at):
     """Return the unsigned ``flat[at : at + 2 * LANES]`` in pairs, two numbers in a lane twice as wide."""
     bits = 2 * flat.dtype.bitwidth
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         pointer = _pointer(context, builder, signature, arguments)
         return builder.load(builder.bitcast(pointer, _vector(bits).as_pointer()), align=_size(flat.dtype))
 
@@ -102,10 +102,10 @@ def load_pairs(typingctx, flat, at):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def firsts(typingctx, pairs):  # type: ignore[no-untyped-def]
+def firsts(typingctx, pairs):
     """Return the first number of each pair, in a lane as wide as a pair's: see :func:`load_pairs`."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         half = ir.IntType(pairs.scalar.bitwidth // 2)
         return builder.zext(builder.trunc(arguments[0], ir.VectorType(half, LANES)), arguments[0].type)
 
@@ -113,10 +113,10 @@ def firsts(typingctx, pairs):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def seconds(typingctx, pairs):  # type: ignore[no-untyped-def]
+def seconds(typingctx, pairs):
     """Return the second number of each pair, in a lane as wide as a pair's: see :func:`load_pairs`."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         half = ir.Constant(arguments[0].type.element, pairs.scalar.bitwidth // 2)
         return builder.lshr(arguments[0], _spread(builder, half))
 
@@ -124,92 +124,92 @@ def seconds(typingctx, pairs):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def add(typingctx, a, b):  # type: ignore[no-untyped-def]
+def add(typingctx, a, b):
     """Return a + b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.add(x, y), lambda builder, x, y: builder.fadd(x, y))
 
 
 @intrinsic
-def sub(typingctx, a, b):  # type: ignore[no-untyped-def]
+def sub(typingctx, a, b):
     """Return a - b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.sub(x, y), lambda builder, x, y: builder.fsub(x, y))
 
 
 @intrinsic
-def mul(typingctx, a, b):  # type: ignore[no-untyped-def]
+def mul(typingctx, a, b):
     """Return a * b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.mul(x, y), lambda builder, x, y: builder.fmul(x, y))
 
 
 @intrinsic
-def bit_and(typingctx, a, b):  # type: ignore[no-untyped-def]
+def bit_and(typingctx, a, b):
     """Return a & b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.and_(x, y))
 
 
 @intrinsic
-def bit_or(typingctx, a, b):  # type: ignore[no-untyped-def]
+def bit_or(typingctx, a, b):
     """Return a | b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.or_(x, y))
 
 
 @intrinsic
-def times(typingctx, a, factor):  # type: ignore[no-untyped-def]
+def times(typingctx, a, factor):
     """Return a * factor, a number of the lanes' type, lane by lane."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.mul(arguments[0], _spread(builder, arguments[1]))
 
     return a(a, a.scalar), emit
 
 
 @intrinsic
-def shift_right(typingctx, a, count):  # type: ignore[no-untyped-def]
+def shift_right(typingctx, a, count):
     """Return a >> count, as signed numbers, lane by lane."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.ashr(arguments[0], _spread(builder, arguments[1]))
 
     return a(a, a.scalar), emit
 
 
 @intrinsic
-def shift_left(typingctx, a, count):  # type: ignore[no-untyped-def]
+def shift_left(typingctx, a, count):
     """Return a << count, lane by lane."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.shl(arguments[0], _spread(builder, arguments[1]))
 
     return a(a, a.scalar), emit
 
 
 @intrinsic
-def to_float(typingctx, a):  # type: ignore[no-untyped-def]
+def to_float(typingctx, a):
     """Return unsigned integers as float32."""
     lanes = Lanes(types.float32)
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.uitofp(arguments[0], ir.VectorType(ir.FloatType(), LANES))
 
     return lanes(a), emit
 
 
 @intrinsic
-def to_int(typingctx, a):  # type: ignore[no-untyped-def]
+def to_int(typingctx, a):
     """Return float32 cut off to int32; anything at all where that does not fit."""
     lanes = Lanes(types.int32)
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.fptosi(arguments[0], _vector(32))
 
     return lanes(a), emit
 
 
 @intrinsic
-def below(typingctx, a, b):  # type: ignore[no-untyped-def]
+def below(typingctx, a, b):
     """Return a uint32 with bit k set where a < b in lane k, as signed numbers or float32; a NaN is below nothing."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         x, y = arguments
         is_whole = isinstance(a.scalar, types.Integer)
         bits = builder.icmp_signed("<", x, y) if is_whole else builder.fcmp_ordered("<", x, y)
@@ -219,20 +219,20 @@ def below(typingctx, a, b):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def equal(typingctx, a, b):  # type: ignore[no-untyped-def]
+def equal(typingctx, a, b):
     """Return a uint32 with bit k set where the integers a and b are equal in lane k."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.bitcast(builder.icmp_signed("==", *arguments), ir.IntType(LANES))
 
     return (types.uint32(a, b), emit) if a == b else None
 
 
 @intrinsic
-def where(typingctx, bits, a, b):  # type: ignore[no-untyped-def]
+def where(typingctx, bits, a, b):
     """Return a where bit k of a uint32 is set, and b elsewhere, lane by lane."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         number, x, y = arguments
         return builder.select(builder.bitcast(number, ir.VectorType(ir.IntType(1), LANES)), x, y)
 
@@ -240,7 +240,7 @@ def where(typingctx, bits, a, b):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def shifted(typingctx, before, a):  # type: ignore[no-untyped-def]
+def shifted(typingctx, before, a):
     """Return ``a`` one lane on; the first lane is the last of ``before``."""
     places = list(range(LANES - 1, 2 * LANES - 1))
     return _two(
@@ -249,22 +249,22 @@ def shifted(typingctx, before, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def smaller(typingctx, a, b):  # type: ignore[no-untyped-def]
+def smaller(typingctx, a, b):
     """Return the smaller of a and b as signed numbers, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.select(builder.icmp_signed("<", x, y), x, y))
 
 
 @intrinsic
-def larger(typingctx, a, b):  # type: ignore[no-untyped-def]
+def larger(typingctx, a, b):
     """Return the larger of a and b as signed numbers, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.select(builder.icmp_signed(">", x, y), x, y))
 
 
 @intrinsic
-def choose(typingctx, x, cut, at_most, above):  # type: ignore[no-untyped-def]
+def choose(typingctx, x, cut, at_most, above):
     """Return ``at_most`` where x <= cut, a number of the lanes' type, and ``above`` elsewhere."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         lanes, number, yes, no = arguments
         return builder.select(builder.icmp_signed("<=", lanes, _spread(builder, number)), yes, no)
 
@@ -272,10 +272,10 @@ def choose(typingctx, x, cut, at_most, above):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def beginning(typingctx, a, count):  # type: ignore[no-untyped-def]
+def beginning(typingctx, a, count):
     """Return ``a`` with 0 in all but the first ``count`` lanes; fewer than 0 or more than all are none or all."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         x, number = arguments
         least, most = (ir.Constant(number.type, n) for n in (0, LANES))
         number = builder.select(builder.icmp_signed("<", number, least), least, number)
@@ -288,10 +288,10 @@ def beginning(typingctx, a, count):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def bit_counts(typingctx, a):  # type: ignore[no-untyped-def]
+def bit_counts(typingctx, a):
     """Return how many bits are set, lane by lane."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         (x,) = arguments
         name = f"llvm.ctpop.v{LANES}i{x.type.element.width}"
         function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(x.type, [x.type]), name)
@@ -301,10 +301,10 @@ def bit_counts(typingctx, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def resized(typingctx, a, like):  # type: ignore[no-untyped-def]
+def resized(typingctx, a, like):
     """Return unsigned ``a`` as lanes of the type of ``like``, which is wide enough for it."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         x, y = arguments
         old, new = x.type.element.width, y.type.element.width
         return x if old == new else (builder.zext if old < new else builder.trunc)(x, y.type)
@@ -313,10 +313,10 @@ def resized(typingctx, a, like):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def running_sums(typingctx, a):  # type: ignore[no-untyped-def]
+def running_sums(typingctx, a):
     """Return in each lane the sum of ``a`` up to it."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         (total,) = arguments
         zeros = ir.Constant(total.type, None)
         step = 1
@@ -331,10 +331,10 @@ def running_sums(typingctx, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def total(typingctx, a):  # type: ignore[no-untyped-def]
+def total(typingctx, a):
     """Return the sum of all lanes of a float64 vector: of its halves, of the halves of that, and so on."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         (sums,) = arguments
         half = LANES // 2
         while half:
@@ -349,10 +349,10 @@ def total(typingctx, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def last(typingctx, a):  # type: ignore[no-untyped-def]
+def last(typingctx, a):
     """Return the last lane of ``a`` in every lane."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         (x,) = arguments
         return builder.shuffle_vector(x, x, ir.Constant(_vector(32), [LANES - 1] * LANES))
 
@@ -360,16 +360,16 @@ def last(typingctx, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def less(typingctx, a, b):  # type: ignore[no-untyped-def]
+def less(typingctx, a, b):
     """Return 1 where a < b as signed numbers and 0 elsewhere."""
     return _two(a, b, lambda builder, x, y: builder.zext(builder.icmp_signed("<", x, y), x.type))
 
 
 @intrinsic
-def within(typingctx, a, low, high):  # type: ignore[no-untyped-def]
+def within(typingctx, a, low, high):
     """Return a uint32 with bit k set where low <= a <= high in lane k, as signed numbers of the lanes' type."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         x, least, greatest = arguments
         above = builder.icmp_signed(">=", x, _spread(builder, least))
         below = builder.icmp_signed("<=", x, _spread(builder, greatest))
@@ -379,13 +379,13 @@ def within(typingctx, a, low, high):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def compress(typingctx, flat, at, bits, a):  # type: ignore[no-untyped-def]
+def compress(typingctx, flat, at, bits, a):
     """Write those lanes of ``a`` whose bit is set one after the other to ``flat`` from ``at`` on; return their end.
 
     What lies behind them is overwritten, as far as all lanes would go.
     """
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         array, place, mask, lanes = arguments
         data = context.make_array(signature.args[0])(context, builder, array).data
         place = context.cast(builder, place, signature.args[1], types.int64)
@@ -409,10 +409,10 @@ def compress(typingctx, flat, at, bits, a):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def lowest(typingctx, bits):  # type: ignore[no-untyped-def]
+def lowest(typingctx, bits):
     """Return the number of the lowest bit that is set in ``bits``, which is not 0."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.zext(builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1)), ir.IntType(64))
 
     return types.int64(types.uint32), emit
@@ -422,7 +422,7 @@ def _two(a: Any, b: Any, on_integers: Any, on_reals: Any = None) -> Any:
     """Return what an intrinsic of two lanes of one type has to."""
     instruction = on_integers if isinstance(a.scalar, types.Integer) else on_reals
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return instruction(builder, *arguments)
 
     return (a(a, b), emit) if a == b else None

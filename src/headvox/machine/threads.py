@@ -42,20 +42,20 @@ _release: Any = types.ExternalFunction("PyThread_release_lock", types.void(types
 
 
 @intrinsic
-def _told(typingctx, flags, at):  # type: ignore[no-untyped-def]
+def _told(typingctx, flags, at):
     """Return ``flags[at]``, and see whatever was written before it was set."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.load_atomic(_address(context, builder, signature, arguments), "acquire", 8)
 
     return types.int64(flags, at), emit
 
 
 @intrinsic
-def _tell(typingctx, flags, at, value):  # type: ignore[no-untyped-def]
+def _tell(typingctx, flags, at, value):
     """Set ``flags[at]``, after everything that was written before."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         builder.store_atomic(arguments[2], _address(context, builder, signature, arguments), "release", 8)
         return context.get_dummy_value()
 
@@ -63,10 +63,10 @@ def _tell(typingctx, flags, at, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def _add(typingctx, counts, at, number):  # type: ignore[no-untyped-def]
+def _add(typingctx, counts, at, number):
     """Return ``counts[at]`` and add to it, in one step, after everything that was written before."""
 
-    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, arguments):
         return builder.atomic_rmw(
             "add", _address(context, builder, signature, arguments), arguments[2], "acq_rel"
         )
@@ -75,7 +75,7 @@ def _add(typingctx, counts, at, number):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def take(counts, at):  # type: ignore[no-untyped-def]
+def take(counts, at):
     """Return ``counts[at]`` and count on, in one step: no two threads get the same."""
     return _add(counts, at, 1)
 
@@ -93,7 +93,7 @@ def _address(context: Any, builder: Any, signature: Any, arguments: Any) -> ir.V
 
 
 @bare_kernel
-def new_alarm():  # type: ignore[no-untyped-def]
+def new_alarm():
     """Return a lock that is held: who asks for it sleeps until it rings. It is never freed: it is some 40 bytes."""
     alarm = _new_lock()
     _acquire(alarm, 1)
@@ -101,14 +101,14 @@ def new_alarm():  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def ring(alarm, flags, turn):  # type: ignore[no-untyped-def]
+def ring(alarm, flags, turn):
     """Wake a thread for what comes after ``turn``, or to end it (:data:`NEVERMORE`)."""
     _tell(flags, RUNG, turn)
     _release(alarm)
 
 
 @bare_kernel
-def begin(flags, turn, to_sleep):  # type: ignore[no-untyped-def]
+def begin(flags, turn, to_sleep):
     """Tell the others that it is their ``turn``, or that in this one they are to sleep."""
     if to_sleep:
         _tell(flags, RESTED, turn)
@@ -116,7 +116,7 @@ def begin(flags, turn, to_sleep):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def wait_for_turn(flags, alarm, asleep, turn, counts, made):  # type: ignore[no-untyped-def]
+def wait_for_turn(flags, alarm, asleep, turn, counts, made):
     """Say that as many calls were ``made``, and wait for the caller to say that it is this ``turn``, or a later one.
 
     Who is ``asleep`` waits for its ``alarm`` first. Return False if there will be no more turns.
@@ -141,13 +141,13 @@ def wait_for_turn(flags, alarm, asleep, turn, counts, made):  # type: ignore[no-
 
 
 @bare_kernel
-def next_call(counts):  # type: ignore[no-untyped-def]
+def next_call(counts):
     """Return the number of a call that nobody has taken yet."""
     return take(counts, TAKEN)
 
 
 @bare_kernel
-def join(counts, calls):  # type: ignore[no-untyped-def]
+def join(counts, calls):
     """Wait until the others have made as many ``calls``, but not for long; return whether they have."""
     for _ in range(PATIENCE):
         if _told(counts, ENDED) >= calls:
@@ -157,7 +157,7 @@ def join(counts, calls):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def _wait(flags, at, value):  # type: ignore[no-untyped-def]
+def _wait(flags, at, value):
     looks = 0
     while _told(flags, at) < value:
         looks += 1

@@ -41,7 +41,7 @@ LARGEST_LOG_SCALE = 0.35
 
 
 @rule
-def _accumulate(J, count, size, A):  # type: ignore[no-untyped-def]
+def _accumulate(J, count, size, A):
     """Set the upper half of A to J W Jᵀ over ``count`` columns, whole vectors, and its last column to J W e.
 
     Many columns are summed side by side, always in the same order, whatever the processor's vectors hold.
@@ -60,7 +60,7 @@ def _accumulate(J, count, size, A):  # type: ignore[no-untyped-def]
 
 
 @rule
-def add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
+def add_turn(A, wx, wy, wz, e, weight):
     """Add to A what one more row with the residual ``e`` says, which knows of the turn alone."""
     A[3, 3] += weight * wx * wx
     A[3, 4] += weight * wx * wy
@@ -74,13 +74,13 @@ def add_turn(A, wx, wy, wz, e, weight):  # type: ignore[no-untyped-def]
 
 
 @rule
-def weight_of_each(n):  # type: ignore[no-untyped-def]
+def weight_of_each(n):
     """Return how much each of ``n`` points counts."""
     return min(1.0, INDEPENDENT / max(n, 1))
 
 
 @rule
-def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told):  # type: ignore[no-untyped-def]
+def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, J, told):
     """Return twice what the first ``n`` points and ``m`` rays cost in ``state``, and how many of them would move it.
 
     ``each`` point has this weight. They have a column in ``J`` each, if it ``steps``. ``told`` receives what the points
@@ -163,7 +163,7 @@ def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, 
 
 
 @rule
-def add_prior_cost(cost, state, modes, upright):  # type: ignore[no-untyped-def]
+def add_prior_cost(cost, state, modes, upright):
     """Return ``cost`` and twice what the priors make ``state`` cost; with those on pitch and roll, if ``upright``."""
     for i in range(3):
         cost += state[i] * state[i] / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
@@ -177,7 +177,7 @@ def add_prior_cost(cost, state, modes, upright):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, state, J, A, told):  # type: ignore[no-untyped-def]
+def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, state, J, A, told):
     """Return the cost of ``state``; write the normal equations to ``A`` (PARAMETERS, PARAMETERS + 1), if it ``steps``.
 
     The first ``n`` points and ``m`` rays count. ``modes`` are fitted, ``k`` is the scale of rho, ``upright`` says
@@ -198,7 +198,7 @@ def linearise(points, n, rays, m, modes, k, upright, steps, rows, low, voxel_m, 
 
 
 @rule
-def add_priors(state, modes, upright, A):  # type: ignore[no-untyped-def]
+def add_priors(state, modes, upright, A):
     """Add the priors on place, size, shape and, if ``upright``, on pitch and roll."""
     w = 1.0 / (CENTRE_SIGMA_M * CENTRE_SIGMA_M)
     for i in range(3):
@@ -217,7 +217,7 @@ def add_priors(state, modes, upright, A):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def solve(A, x, size):  # type: ignore[no-untyped-def]
+def solve(A, x, size):
     """Leave the Cholesky factor in the lower half of A, and the step -A⁻¹ (column RESIDUAL) in x; return ½ log det."""
     half_log_det = factor(A, size)
     for i in range(size):
@@ -227,7 +227,7 @@ def solve(A, x, size):  # type: ignore[no-untyped-def]
 
 
 @rule
-def invert_column(A, x, c):  # type: ignore[no-untyped-def]
+def invert_column(A, x, c):
     """Leave column ``c`` of (L Lᵀ)⁻¹ in ``x``, L the lower half of A."""
     for i in range(PARAMETERS):
         x[i] = 1.0 if i == c else 0.0
@@ -235,7 +235,7 @@ def invert_column(A, x, c):  # type: ignore[no-untyped-def]
 
 
 @rule
-def invert(A, x, covariance):  # type: ignore[no-untyped-def]
+def invert(A, x, covariance):
     """Write the first 6x6 of the inverse to ``covariance``: of shift and turn, all else unknown."""
     for c in range(6):
         invert_column(A, x, c)
@@ -244,7 +244,7 @@ def invert(A, x, covariance):  # type: ignore[no-untyped-def]
 
 
 @rule
-def move(state, x, size):  # type: ignore[no-untyped-def]
+def move(state, x, size):
     """Take the step ``x``, cut to a bearable length."""
     step = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
     turn = np.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])

@@ -33,7 +33,7 @@ UNKNOWN_SIGMA_M = 0.002  # of points whose sensor nobody knows
 
 
 @rule
-def view(T, x, y, z, length, out, at):  # type: ignore[no-untyped-def]
+def view(T, x, y, z, length, out, at):
     """Write the unit direction of the sensor's ray x, y, z to out[at, 3:6]."""
     out[at, 3] = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) / length
     out[at, 4] = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) / length
@@ -41,14 +41,14 @@ def view(T, x, y, z, length, out, at):  # type: ignore[no-untyped-def]
 
 
 @rule
-def place(T, along, out, at):  # type: ignore[no-untyped-def]
+def place(T, along, out, at):
     """Write the point ``along`` metres on the ray of out[at, 3:6] to out[at, :3]."""
     for i in range(3):
         out[at, i] = out[at, 3 + i] * along + T[i, 3]
 
 
 @rule
-def _thin(buffer, first, end):  # type: ignore[no-untyped-def]
+def _thin(buffer, first, end):
     """Keep every second row of buffer[first:end]; return the new end."""
     kept = (end - first + 1) // 2
     for i in range(kept):
@@ -58,7 +58,7 @@ def _thin(buffer, first, end):  # type: ignore[no-untyped-def]
 
 
 @rule
-def window(middle, depth, reach, focal, centre, size):  # type: ignore[no-untyped-def]
+def window(middle, depth, reach, focal, centre, size):
     """Return the first and the last-but-one pixel, along one axis of an image, that a ball covers."""
     near, far = depth - reach, depth + reach
     if near < 0.05:
@@ -70,7 +70,7 @@ def window(middle, depth, reach, focal, centre, size):  # type: ignore[no-untype
 
 
 @rule
-def window_of(lens, T, reach, height, width, most):  # type: ignore[no-untyped-def]
+def window_of(lens, T, reach, height, width, most):
     """Return the origin's place in the camera's frame, and which columns and rows of an image to look at, and how many.
 
     ``most`` pixels are looked at: every ``stride``-th of columns u0 to u1 and rows v0 to v1.
@@ -90,7 +90,7 @@ def window_of(lens, T, reach, height, width, most):  # type: ignore[no-untyped-d
 
 
 @rule
-def look_at_pixel(raw, u, v, lens, origin, reach):  # type: ignore[no-untyped-def]
+def look_at_pixel(raw, u, v, lens, origin, reach):
     """Return what a pixel shows, the x and y of its ray (z is 1) and its depth, the ray's length, and where along it.
 
     It is where the ray is nearest to the origin.
@@ -112,7 +112,7 @@ def look_at_pixel(raw, u, v, lens, origin, reach):  # type: ignore[no-untyped-de
 
 
 @rule
-def keep_pixel(T, x, y, z, length, lens, samples, n):  # type: ignore[no-untyped-def]
+def keep_pixel(T, x, y, z, length, lens, samples, n):
     """Write what :func:`look_at_pixel` told of a pixel to samples[n]."""
     view(T, x, y, 1.0, length, samples, n)
     place(T, z * length, samples, n)
@@ -121,7 +121,7 @@ def keep_pixel(T, x, y, z, length, lens, samples, n):  # type: ignore[no-untyped
 
 
 @bare_kernel
-def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
+def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):
     """Add what one depth image shows near the origin of the frame that ``T`` (3, 4) maps the camera to.
 
     ``lens`` holds fx, fy, cx, cy and the depth scale. Points within ``reach`` go to ``samples``, rays that pass within
@@ -144,7 +144,7 @@ def gather_depth(depth, lens, T, reach, n, m, most_n, most_m, samples, rays):  #
 
 
 @rule
-def _ball(T, reach):  # type: ignore[no-untyped-def]
+def _ball(T, reach):
     """Return, for :func:`_may_be_near`, the origin's place in the sensor's frame, and two bounds (m²).
 
     They are wide enough for what rounding to float32 and a transform that is not quite rigid may change.
@@ -159,7 +159,7 @@ def _ball(T, reach):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _may_be_near(flat, at, ball, knows):  # type: ignore[no-untyped-def]
+def _may_be_near(flat, at, ball, knows):
     """Return a bit for each of the LANES points from ``flat[at]`` on: 0 for what is neither near nor passes near.
 
     Without a sensor that is what lies outside of a ball, and with one whose ray misses it: d² < r², where the square of
@@ -176,7 +176,7 @@ def _may_be_near(flat, at, ball, knows):  # type: ignore[no-untyped-def]
 
 
 @rule
-def look_at_point(px, py, pz, T, knows, reach):  # type: ignore[no-untyped-def]
+def look_at_point(px, py, pz, T, knows, reach):
     """Return what a point shows, its turned coordinates, the square of its distance from the sensor, and where along.
 
     It is where its ray is nearest to the origin, times the ray's length.
@@ -197,7 +197,7 @@ def look_at_point(px, py, pz, T, knows, reach):  # type: ignore[no-untyped-def]
 
 
 @rule
-def keep_point(T, x, y, z, squared, knows, samples, n):  # type: ignore[no-untyped-def]
+def keep_point(T, x, y, z, squared, knows, samples, n):
     """Write what :func:`look_at_point` told of a point that is near to samples[n]."""
     samples[n, 0], samples[n, 1], samples[n, 2] = x + T[0, 3], y + T[1, 3], z + T[2, 3]
     samples[n, 3], samples[n, 4], samples[n, 5] = 0.0, 0.0, 0.0
@@ -210,7 +210,7 @@ def keep_point(T, x, y, z, squared, knows, samples, n):  # type: ignore[no-untyp
 
 
 @rule
-def keep_passing(T, x, y, z, squared, along, rays, m):  # type: ignore[no-untyped-def]
+def keep_passing(T, x, y, z, squared, along, rays, m):
     """Write what :func:`look_at_point` told of a point whose ray passes by to rays[m]."""
     length = np.sqrt(squared)
     rays[m, 3], rays[m, 4], rays[m, 5] = x / length, y / length, z / length
@@ -218,7 +218,7 @@ def keep_passing(T, x, y, z, squared, along, rays, m):  # type: ignore[no-untype
 
 
 @bare_kernel
-def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):  # type: ignore[no-untyped-def]
+def gather_points(points, T, knows, reach, n, m, most_n, most_m, samples, rays):
     """Add what a cloud shows; ``T`` (3, 4) maps its frame, ``knows`` says whether the sensor is at its origin.
 
     When there is more than ``most_n`` or ``most_m``, every second one is kept, so the rest stays evenly spread.

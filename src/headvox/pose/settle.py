@@ -28,7 +28,7 @@ class Refined(NamedTuple):
 
 
 @bare_kernel
-def finish_all(work, trials, heads, taken, centres, template, poses):  # type: ignore[no-untyped-def]
+def finish_all(work, trials, heads, taken, centres, template, poses):
     """Polish the best of what was tried of each of the first ``heads``, and write it to ``poses``.
 
     Others do so too: they count the heads that are ``taken`` (1,).
@@ -49,7 +49,7 @@ def finish_all(work, trials, heads, taken, centres, template, poses):  # type: i
 
 
 @rule
-def assess(told, points, rays, poses, i):  # type: ignore[no-untyped-def]
+def assess(told, points, rays, poses, i):
     """Write to row ``i`` of ``poses`` how well a head fits, from what is ``told`` of so many points and rays."""
     poses.misfits[i] = told[COST] / points
     poses.coverages[i] = told[ON_SURFACE] / points
@@ -57,7 +57,7 @@ def assess(told, points, rays, poses, i):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def settle(refined, count, best, centre, template, poses, i):  # type: ignore[no-untyped-def]
+def settle(refined, count, best, centre, template, poses, i):
     """Write the ``best`` of ``count`` states to row ``i`` of ``poses``, with covariances that know of the others.
 
     The states are a mixture: each is as probable as its evidence says, and stands as far from the best as it does. An
@@ -104,7 +104,7 @@ def settle(refined, count, best, centre, template, poses, i):  # type: ignore[no
 
 
 @rule
-def recentre(state, template, poses, i):  # type: ignore[no-untyped-def]
+def recentre(state, template, poses, i):
     """Move the centre in row ``i`` of ``poses`` to where a head of the shape in ``state`` has it."""
     scale = np.exp(state[12])
     for c in range(3):
@@ -116,14 +116,14 @@ def recentre(state, template, poses, i):  # type: ignore[no-untyped-def]
 
 
 @rule
-def odds(told, s, best, temperature):  # type: ignore[no-untyped-def]
+def odds(told, s, best, temperature):
     """Return how probable state ``s`` is, the best being 1; 0 for one whose evidence is not a number."""
     odds = np.exp((told[best, EVIDENCE] - told[s, EVIDENCE]) / temperature)
     return odds if np.isfinite(odds) else 0.0
 
 
 @bare_kernel
-def turn_between(one, other):  # type: ignore[no-untyped-def]
+def turn_between(one, other):
     """Return the rotation vector, in the axes of state ``one``, that turns its rotation to that of ``other``."""
     # R1ᵀ R2: column c of R1 times column d of R2
     x, y, z, w = quaternion_of(
@@ -141,13 +141,13 @@ def turn_between(one, other):  # type: ignore[no-untyped-def]
 
 
 @rule
-def column(one, c, other, d):  # type: ignore[no-untyped-def]
+def column(one, c, other, d):
     """Return the product of two columns of the rotations in two states."""
     return one[3 + c] * other[3 + d] + one[6 + c] * other[6 + d] + one[9 + c] * other[9 + d]
 
 
 @bare_kernel
-def quaternion_of(r00, r01, r02, r10, r11, r12, r20, r21, r22):  # type: ignore[no-untyped-def]
+def quaternion_of(r00, r01, r02, r10, r11, r12, r20, r21, r22):
     """Return x, y, z, w of a rotation matrix, by its greatest component (Shepperd, 1978)."""
     trace = r00 + r11 + r22
     if trace >= r00 and trace >= r11 and trace >= r22:
@@ -163,7 +163,7 @@ def quaternion_of(r00, r01, r02, r10, r11, r12, r20, r21, r22):  # type: ignore[
 
 
 @bare_kernel
-def expect_turns(centres, places, quaternions, reaches, turns):  # type: ignore[no-untyped-def]
+def expect_turns(centres, places, quaternions, reaches, turns):
     """Write to ``turns`` (N, 9) the rotation of the nearest of ``places`` (M, 3) in reach of each of ``centres``.
 
     A row stays as it is where there is none; a place whose quaternion is not known counts for nothing.

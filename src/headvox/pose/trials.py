@@ -102,13 +102,13 @@ class Trials(NamedTuple):
 
 
 @rule
-def evenly(s, used, there):  # type: ignore[no-untyped-def]
+def evenly(s, used, there):
     """Return which row of all that are ``there`` is the ``s``-th of those that are ``used``."""
     return (2 * s + 1) * there // (2 * used)
 
 
 @rule
-def choose(source, there, target, most):  # type: ignore[no-untyped-def]
+def choose(source, there, target, most):
     """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many."""
     used = min(there, most)
     for s in range(used):
@@ -119,21 +119,21 @@ def choose(source, there, target, most):  # type: ignore[no-untyped-def]
 
 
 @rule
-def begin(state, turn):  # type: ignore[no-untyped-def]
+def begin(state, turn):
     """Let ``state`` be the mean head, turned as ``turn`` (9,) says."""
     for j in range(STATE):
         state[j] = turn[j - 3] if 3 <= j < 12 else 0.0
 
 
 @bare_kernel
-def is_round(samples, n):  # type: ignore[no-untyped-def]
+def is_round(samples, n):
     """Whether points whose sensor nobody knows lie all around: a shell, whose neck and gravity need not be right."""
     seen, near, x, y, z = lean(samples, 0, n)
     return not seen and near >= LEAST_SAMPLES and np.sqrt(x * x + y * y + z * z) < ROUND_SHARE * near
 
 
 @rule
-def lean(samples, first, after):  # type: ignore[no-untyped-def]
+def lean(samples, first, after):
     """Return whether a sensor is known of samples[first:after], how many are near, and the sum of their directions.
 
     Where one is known, nothing else is told.
@@ -155,7 +155,7 @@ def lean(samples, first, after):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def search(work, n, m, expected, upright, anyhow, template, trials, i):  # type: ignore[no-untyped-def]
+def search(work, n, m, expected, upright, anyhow, template, trials, i):
     """Find the states of head ``i`` of ``trials`` that are worth refining.
 
     Near it lie the first ``n`` samples and ``m`` rays of ``work``.
@@ -190,13 +190,13 @@ def search(work, n, m, expected, upright, anyhow, template, trials, i):  # type:
 
 
 @rule
-def is_trusted(told, points):  # type: ignore[no-untyped-def]
+def is_trusted(told, points):
     """Return whether what is ``told`` of an expected state, refined on so many ``points``, needs no other beside it."""
     return told[COST] <= POOR * points
 
 
 @bare_kernel
-def explore(work, used, rays, starts, upright, template):  # type: ignore[no-untyped-def]
+def explore(work, used, rays, starts, upright, template):
     """Take a few steps from each of ``starts`` (S, 9), on the ``used`` points and none of the ``rays``.
 
     States and costs are left in ``work``.
@@ -217,7 +217,7 @@ def explore(work, used, rays, starts, upright, template):  # type: ignore[no-unt
 
 
 @rule
-def pick_all(costs, coarse, count, picked, tried):  # type: ignore[no-untyped-def]
+def pick_all(costs, coarse, count, picked, tried):
     """Write the best of ``count`` starts behind the ``tried`` states in ``picked``; return how many there are then."""
     least = np.inf
     for i in range(count):
@@ -233,7 +233,7 @@ def pick_all(costs, coarse, count, picked, tried):  # type: ignore[no-untyped-de
 
 
 @rule
-def pick(costs, count, least, coarse, picked, tried):  # type: ignore[no-untyped-def]
+def pick(costs, count, least, coarse, picked, tried):
     """Return the best of the ``count`` starts that is not done yet, and mark it as done; -1 where none is worth it.
 
     The best one cost ``least``. A start that came to what was ``picked`` before is not worth it.
@@ -257,7 +257,7 @@ def pick(costs, count, least, coarse, picked, tried):  # type: ignore[no-untyped
 
 
 @bare_kernel
-def list_jobs(trials, heads):  # type: ignore[no-untyped-def]
+def list_jobs(trials, heads):
     """List the states of the first ``heads`` that are tried and not refined yet; return how many."""
     jobs = 0
     for i in range(heads):
@@ -268,7 +268,7 @@ def list_jobs(trials, heads):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def refine_all(work, trials, jobs, taken, template):  # type: ignore[no-untyped-def]
+def refine_all(work, trials, jobs, taken, template):
     """Refine what was listed, ``jobs`` states in all, with other threads that count what is ``taken`` (1,)."""
     while True:
         k = take(taken, 0)
@@ -278,7 +278,7 @@ def refine_all(work, trials, jobs, taken, template):  # type: ignore[no-untyped-
 
 
 @bare_kernel
-def refine(work, trials, i, at, template):  # type: ignore[no-untyped-def]
+def refine(work, trials, i, at, template):
     """Take the steps of the first modes from the state ``at`` of head ``i``.
 
     The last state, and what it costs, are left in ``trials``.
@@ -298,7 +298,7 @@ def refine(work, trials, i, at, template):  # type: ignore[no-untyped-def]
 
 
 @rule
-def best_of(told, count):  # type: ignore[no-untyped-def]
+def best_of(told, count):
     """Return which of ``count`` refined states has the best evidence; -1 where there is none."""
     best = np.int64(0)
     for s in range(1, count):
@@ -308,7 +308,7 @@ def best_of(told, count):  # type: ignore[no-untyped-def]
 
 
 @bare_kernel
-def polish(work, trials, i, at, template):  # type: ignore[no-untyped-def]
+def polish(work, trials, i, at, template):
     """Take the last steps, of all modes and on more points and rays, from the state ``at`` of head ``i``.
 
     The state, what is told of it, but for the evidence, and its covariance are left in ``trials``.

@@ -32,7 +32,7 @@ VIEW_M = 0.015  # how much a mean height depends on the side that a head is seen
 
 
 @kernel
-def price(roster, centres, R, sure, gate, now_ns, costs):  # type: ignore[no-untyped-def]
+def price(roster, centres, R, sure, gate, now_ns, costs):
     """Write to ``costs`` (N, M) how unlikely each of M heads is to be that of each of N tracks: -2 ln of the density.
 
     ``NOT_A_PAIR`` where it cannot be: farther than ``gate`` (squared Mahalanobis distance), or than anybody goes, or a
@@ -72,7 +72,7 @@ def price(roster, centres, R, sure, gate, now_ns, costs):  # type: ignore[no-unt
 
 
 @kernel
-def note_sightings(roster, tracks, found, now_ns, centres, radii, scores, sure, strong):  # type: ignore[no-untyped-def]
+def note_sightings(roster, tracks, found, now_ns, centres, radii, scores, sure, strong):
     """Enter for the ``tracks`` (K,) which of the heads were ``found`` (K,); their filters are corrected already.
 
     A sighting that scores ``strong`` counts for one, and none for more than ``MOST_STRENGTH``.

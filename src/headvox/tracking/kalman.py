@@ -32,7 +32,7 @@ REJECTED_BEFORE_RESET = 5  # orientations in a row that contradict a track befor
 
 
 @rule
-def _invert(S, out):  # type: ignore[no-untyped-def]
+def _invert(S, out):
     """Write the inverse of the symmetric (3, 3) ``S`` to ``out``; return its determinant."""
     a = S[1, 1] * S[2, 2] - S[1, 2] * S[1, 2]
     b = S[0, 2] * S[1, 2] - S[0, 1] * S[2, 2]
@@ -48,7 +48,7 @@ def _invert(S, out):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _squared(S_inverse, d):  # type: ignore[no-untyped-def]
+def _squared(S_inverse, d):
     """Return dᵀ S⁻¹ d."""
     total = 0.0
     for i in range(3):
@@ -58,7 +58,7 @@ def _squared(S_inverse, d):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _drift(P, dt, density):  # type: ignore[no-untyped-def]
+def _drift(P, dt, density):
     """Predict the (6, 6) covariance of a value and its rate: F P Fᵀ + Q, with white noise on the rate's rate."""
     for i in range(3):
         for j in range(3):
@@ -70,14 +70,14 @@ def _drift(P, dt, density):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _fade(dt, fade_s):  # type: ignore[no-untyped-def]
+def _fade(dt, fade_s):
     """Return how far a rate of 1 that fades within ``fade_s`` goes on in ``dt``, and what is left of it then."""
     left = np.exp(-dt / fade_s)
     return fade_s * (1.0 - left), left
 
 
 @rule
-def _go_on(P, i, way, left):  # type: ignore[no-untyped-def]
+def _go_on(P, i, way, left):
     """Predict the (6, 6) covariance: value ``i`` goes on by ``way`` times its rate, of which this much is ``left``."""
     for j in range(6):
         P[i, j] += way * P[3 + i, j]
@@ -88,7 +88,7 @@ def _go_on(P, i, way, left):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _slow_down(x, P, dt, fade_s):  # type: ignore[no-untyped-def]
+def _slow_down(x, P, dt, fade_s):
     """Predict the (6,) state and its covariance of what slows down: a speed that fades within ``fade_s`` (3,)."""
     for i in range(3):
         way, left = _fade(dt, fade_s[i])
@@ -98,7 +98,7 @@ def _slow_down(x, P, dt, fade_s):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _stir(P, dt, density):  # type: ignore[no-untyped-def]
+def _stir(P, dt, density):
     """Add to the (6, 6) covariance of a value and its rate what white noise on the rate's rate does in ``dt``."""
     for i in range(3):
         P[i, i] += density[i] * dt * dt * dt / 3.0
@@ -109,7 +109,7 @@ def _stir(P, dt, density):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _exchange(x, P, still, moving):  # type: ignore[no-untyped-def]
+def _exchange(x, P, still, moving):
     """Let each of the two models begin from a mixture: of its own state by the share given, else of the other's."""
     for a in range(6):
         for b in range(a, 6):
@@ -124,7 +124,7 @@ def _exchange(x, P, still, moving):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _correct(P, S, S_inverse, d, gain, step):  # type: ignore[no-untyped-def]
+def _correct(P, S, S_inverse, d, gain, step):
     """Kalman update for a measured (3,) difference ``d`` of covariance ``S``.
 
     What is to be added to the state goes to ``step``. The (6, 6) ``P`` becomes P - K S Kᵀ, symmetric to the last bit.
@@ -144,7 +144,7 @@ def _correct(P, S, S_inverse, d, gain, step):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _turn(vector, out):  # type: ignore[no-untyped-def]
+def _turn(vector, out):
     """Write the quaternion of the rotation vector in the first three of ``vector`` [rad] to ``out``."""
     x, y, z = vector[0], vector[1], vector[2]
     angle = np.sqrt(x * x + y * y + z * z)
@@ -153,7 +153,7 @@ def _turn(vector, out):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _compose(a, b, out):  # type: ignore[no-untyped-def]
+def _compose(a, b, out):
     """Write the quaternion product a b, of length 1, to ``out``."""
     x = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
     y = a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0]
@@ -164,7 +164,7 @@ def _compose(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _between(a, b, out):  # type: ignore[no-untyped-def]
+def _between(a, b, out):
     """Write the rotation vector d of b = a exp(d), at most pi long, to ``out``."""
     x = a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1]
     y = a[3] * b[1] + a[0] * b[2] - a[1] * b[3] - a[2] * b[0]
@@ -178,7 +178,7 @@ def _between(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _rotated(q, a, b):  # type: ignore[no-untyped-def]
+def _rotated(q, a, b):
     """Return the entry a, b of the rotation matrix of the quaternion ``q``."""
     if a == b:
         return 1.0 - 2.0 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] - q[a] * q[a])
@@ -187,7 +187,7 @@ def _rotated(q, a, b):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _new_axes(C, q, half):  # type: ignore[no-untyped-def]
+def _new_axes(C, q, half):
     """Write the covariance of a turn, in axes that have moved on by the quaternion ``q``, over the first of ``C``."""
     for i in range(3):
         for j in range(6):
@@ -208,7 +208,7 @@ def _new_axes(C, q, half):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def predict_places(roster, before_ns, dt, still_s, moving_s, wander, density, fade_s):  # type: ignore[no-untyped-def]
+def predict_places(roster, before_ns, dt, still_s, moving_s, wander, density, fade_s):
     """Mix the models and predict each by ``dt`` seconds, in place.
 
     ``still_s`` and ``moving_s`` are the mean times between a change of model [s], ``wander`` the variance that a still
@@ -242,7 +242,7 @@ def predict_places(roster, before_ns, dt, still_s, moving_s, wander, density, fa
 
 
 @kernel
-def predict_turns(roster, dt, density, fade_s):  # type: ignore[no-untyped-def]
+def predict_turns(roster, dt, density, fade_s):
     """Predict orientations by ``dt`` seconds, in place; ``density`` (3,) [rad²/s³] is of white turn acceleration.
 
     A turn fades within ``fade_s``. If its rate stayed, a track that is put right by a great angle would take that for a
@@ -266,7 +266,7 @@ def predict_turns(roster, dt, density, fade_s):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def combine(row, mean, cov):  # type: ignore[no-untyped-def]
+def combine(row, mean, cov):
     """Write the mean (6,) and the covariance (6, 6) of both models of a track together."""
     x, P, still, moving = row.x, row.P, row.weights[STILL], row.weights[MOVING]
     for a in range(6):
@@ -277,13 +277,13 @@ def combine(row, mean, cov):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def widest(cov):  # type: ignore[no-untyped-def]
+def widest(cov):
     """Return the standard deviation of a place of covariance ``cov`` (6, 6), over all axes together [m]."""
     return np.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
 
 
 @rule
-def _surprise(x, P, weights, centre, R, S, S_inverse, d):  # type: ignore[no-untyped-def]
+def _surprise(x, P, weights, centre, R, S, S_inverse, d):
     """Return -2 ln of how likely a measured ``centre`` of covariance ``R`` is, of both models together [ln m⁻³]."""
     best, total = -np.inf, 0.0
     for i in range(2):
@@ -302,7 +302,7 @@ def _surprise(x, P, weights, centre, R, S, S_inverse, d):  # type: ignore[no-unt
 
 
 @kernel
-def compare(roster, mean, cov, centres, R, squared, surprise):  # type: ignore[no-untyped-def]
+def compare(roster, mean, cov, centres, R, squared, surprise):
     """Write how well each of M measured ``centres`` fits to each of N tracks, both (N, M).
 
     ``squared`` is the squared Mahalanobis distance from ``mean`` and ``cov`` (of :func:`combine`), ``surprise`` -2 ln
@@ -324,7 +324,7 @@ def compare(roster, mean, cov, centres, R, squared, surprise):  # type: ignore[n
 
 
 @kernel
-def correct_places(roster, tracks, heads, centres, R):  # type: ignore[no-untyped-def]
+def correct_places(roster, tracks, heads, centres, R):
     """Update the tracks with index ``tracks`` (K,) by the measured centres with index ``heads`` (K,), in place."""
     S, S_inverse, d = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     gain, step, fit = np.empty((6, 3)), np.empty(6), np.empty(2)
@@ -348,7 +348,7 @@ def correct_places(roster, tracks, heads, centres, R):  # type: ignore[no-untype
 
 
 @kernel
-def correct_turns(roster, tracks, heads, measured, R, gate):  # type: ignore[no-untyped-def]
+def correct_turns(roster, tracks, heads, measured, R, gate):
     """Update orientations by the ``measured`` quaternions, in place; rows of NaN are passed over.
 
     One that lies farther than ``gate`` (squared Mahalanobis distance) is taken for a flip and left out. After

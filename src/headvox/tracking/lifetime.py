@@ -13,7 +13,7 @@ MOST_DRAIN = 0.5  # of its life a track loses in one frame, however long: one mi
 
 
 @kernel
-def turn_page(roster, stamp_ns, longest_ns, frames, kept):  # type: ignore[no-untyped-def]
+def turn_page(roster, stamp_ns, longest_ns, frames, kept):
     """Begin a frame: no hit in it yet, of so many ``frames`` that are remembered.
 
     Write which rows are not forgotten, seen ``longest_ns`` ago at most; return whether all are ``kept`` (N,).
@@ -26,7 +26,7 @@ def turn_page(roster, stamp_ns, longest_ns, frames, kept):  # type: ignore[no-un
 
 
 @kernel
-def age(roster, now_ns, dt, states, lasts_s, present_s, weak_s):  # type: ignore[no-untyped-def]
+def age(roster, now_ns, dt, states, lasts_s, present_s, weak_s):
     """Let every track that was not surely seen at ``now_ns`` lose life and trust; mark the dead as lost.
 
     ``states`` (N,) says what was seen of the places of those that were not seen at all, ``lasts_s`` (5,) how long a
@@ -55,7 +55,7 @@ def age(roster, now_ns, dt, states, lasts_s, present_s, weak_s):  # type: ignore
 
 
 @kernel
-def judge_new(roster, least, frames, ready, kept):  # type: ignore[no-untyped-def]
+def judge_new(roster, least, frames, ready, kept):
     """Write which tracks without an id (N,) get one, and which are not given up.
 
     It takes ``least`` sightings within ``frames`` frames, as many more as make up for what they score less, and one for

@@ -14,7 +14,7 @@ SHARE = 1.0 / 30.0  # of the newest sighting in what is thought of the noise
 
 
 @rule
-def _be_round(R, sigma):  # type: ignore[no-untyped-def]
+def _be_round(R, sigma):
     """Write to ``R`` (3, 3) the covariance of what is off by ``sigma`` along each axis."""
     for a in range(3):
         for b in range(3):
@@ -36,7 +36,7 @@ def measurement_noise(heads: Heads, frame: Frame) -> tuple[F64, F64]:
 
 
 @kernel
-def guess(centres, eyes, R_centre, R_turn):  # type: ignore[no-untyped-def]
+def guess(centres, eyes, R_centre, R_turn):
     """Write a guess over the covariances (N, 3, 3) that are not known; ``eyes`` (S, 3) are where the sensors stand."""
     for n in range(centres.shape[0]):
         if np.isnan(R_centre[n, 0, 0]):
@@ -50,7 +50,7 @@ def guess(centres, eyes, R_centre, R_turn):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def widen(roster, tracks, found, now_ns, centres, R):  # type: ignore[no-untyped-def]
+def widen(roster, tracks, found, now_ns, centres, R):
     """Add to the covariances ``R`` of the heads ``found`` (K,) how much the sightings of their ``tracks`` (K,) scatter.
 
     Three sightings in a row tell the noise from any motion but the strongest: the third from the line through the first

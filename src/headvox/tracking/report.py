@@ -64,7 +64,7 @@ def tentative(heads: Heads, stamp_ns: int) -> Tracks:
 
 
 @kernel
-def stated(roster, last_ns, order):  # type: ignore[no-untyped-def]
+def stated(roster, last_ns, order):
     """Write to ``order`` (N,) which rows are stated: by id, then those without one. Return how many."""
     count = 0
     for n in range(roster.shape[0]):
@@ -81,7 +81,7 @@ def stated(roster, last_ns, order):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def copy_out(  # type: ignore[no-untyped-def]
+def copy_out(
     roster, order, last_ns, stamp_ns,
     ids, states, centres, velocities, quaternions, rates, radii, scores, covariances, turns, ages_s, unseen_s,
 ):  # fmt: skip
@@ -107,7 +107,7 @@ def copy_out(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def expect(roster, centres, quaternions, reaches_m):  # type: ignore[no-untyped-def]
+def expect(roster, centres, quaternions, reaches_m):
     """Write the columns (N, ...) of :class:`headvox.data.Expected`; return how many rows of them there are."""
     mean, cov = np.empty(6), np.empty((6, 6))
     count = 0

@@ -75,7 +75,7 @@ def _origin(cloud: Cloud) -> F64:
 
 
 @rule
-def _root(P):  # type: ignore[no-untyped-def]
+def _root(P):
     """Return a, b, c of the lower triangular root (a, 0; b, c) of a covariance along the floor."""
     a = np.sqrt(P[0, 0])
     b = P[0, 1] / a
@@ -83,14 +83,14 @@ def _root(P):  # type: ignore[no-untyped-def]
 
 
 @rule
-def _apart(places, at):  # type: ignore[no-untyped-def]
+def _apart(places, at):
     """Return the squared distance of two places."""
     x, y, z = places[0] - at[0], places[1] - at[1], places[2] - at[2]
     return x * x + y * y + z * z
 
 
 @kernel
-def spread(roster, rows, places):  # type: ignore[no-untyped-def]
+def spread(roster, rows, places):
     """Write ``places`` (N, SAMPLES, 3) where the heads of the tracks ``rows`` (N,) may be."""
     for k in range(rows.shape[0]):
         s = 0
@@ -106,7 +106,7 @@ def spread(roster, rows, places):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def weigh(roster, rows, places, seen, centres, weights):  # type: ignore[no-untyped-def]
+def weigh(roster, rows, places, seen, centres, weights):
     """Write how likely each of the ``places`` (N, SAMPLES, 3) is: ``weights`` (N, SAMPLES).
 
     ``seen`` (N, SAMPLES) is what the sensors saw of them, ``centres`` (M, 3) are the heads that were found. Before any
@@ -132,7 +132,7 @@ def weigh(roster, rows, places, seen, centres, weights):  # type: ignore[no-unty
 
 
 @kernel
-def narrow(roster, rows, weights):  # type: ignore[no-untyped-def]
+def narrow(roster, rows, weights):
     """Give the models of the tracks ``rows`` (N,) mean and covariance of their ``weights`` (N, SAMPLES), in place.
 
     With P_ff = L Lᵀ for the floor's part of a covariance, and mean m and covariance C of the samples in steps of L,
@@ -180,7 +180,7 @@ def narrow(roster, rows, weights):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def conclude(roster, rows, places, seen, weights, states):  # type: ignore[no-untyped-def]
+def conclude(roster, rows, places, seen, weights, states):
     """Write to ``states`` (N,) what most that is left of each track was seen as; mark as absent who may be anywhere."""
     mean, cov = np.empty(6), np.empty((6, 6))
     mass = np.empty(SEEN_EMPTY + 1)

@@ -40,7 +40,7 @@ MADE_FIRST = [
 ]
 # Commands in blocks of sh and bash that do not run here, by how they begin.
 NOT_RUN_HERE = {
-    "headvox masks evolve": "takes a night; a small search runs in test_evolve.py",
+    "headvox masks evolve": "takes a night; a small search runs in tests/evolve",
     "headvox bench": "takes minutes; a quick one runs in test_bench.py",
     "headvox synth two-cameras --people 1": "a longer one of what README makes",
     "headvox run s3://": "needs a cluster and a bucket; test_workers.py has small ones of both",

@@ -1,0 +1,93 @@
+"""What is fitted after the search: the last stage and the last look, on spoilt views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from easy_search import easy_view, samples_of
+
+from headvox.evolve import again, samples, search, views
+from headvox.evolve import relief as last_look
+from headvox.masks.cascade import cuts
+from headvox.masks.read import load_cascade
+
+
+def doubtful_peaks(view: views.View, cascade) -> again.Peaks | None:
+    """The peaks of an easy view, of which those of every third are said to be no heads: else all of them are."""
+    peaks = again.spoilt_peaks(view, cascade)
+    if peaks is None or view.number % 3:
+        return peaks
+    return replace(peaks, samples=replace(peaks.samples, label=0 * peaks.samples.label))
+
+
+def doubtful_looks(view: views.View, cascade) -> last_look.Looks | None:
+    """As :func:`doubtful_peaks`."""
+    looks = last_look.spoilt_looks(view, cascade)
+    return looks if looks is None or view.number % 3 else replace(looks, label=0 * looks.label)
+
+
+def test_heads_that_the_border_cuts_are_heads_to_the_last_stage_and_dummies_neither():
+    far_apart = np.array([[0.0, 0, 1.5], [1, 0, 1.5], [2, 0, 1.5], [3, 0, 1.5]])
+    clear, visible = np.array([True, False, False, False]), np.array([0.9, 0.6, 0.9, 0.1])
+    posture = np.array([0, 0, len(views.POSTURES), 0])  # whole, cut, a dummy, hardly seen
+    view = easy_view(None, 0, 1)
+    view = replace(view, heads=views.Heads(far_apart, visible, clear, posture))
+    found = (far_apart[None] + np.array([0.0, 0.2, 0.5])[:, None, None] * [1, 0, 0]).reshape(-1, 3)
+    label, bag = again.label_places(view, found)
+    assert label.tolist() == [1, 1, -1, -1] + [-1] * 4 + [0] * 4
+    assert bag.tolist() == [100, 101] + [-1] * 10
+
+
+def test_the_last_stage_is_single_cuts_over_what_was_asked_before(evolved, monkeypatch):
+    folder, found, _ = evolved
+    monkeypatch.setattr(search, "keep_view", easy_view)
+    monkeypatch.setattr(search, "spoilt_peaks", doubtful_peaks)
+    monkeypatch.setattr(again, "LEAST_ROWS", 5)
+    monkeypatch.setattr(samples, "RANGE_M", 2.8)
+    said: list[str] = []
+    more = search._with_second_opinion(search.Settings(folder, 200, "easy"), found, said.append)
+    assert said[-1].startswith("asked again: ")
+    once, twice = (load_cascade(str(folder / name)) for name in ("once.toml", "twice.toml"))
+    assert twice.groups == once.groups
+    assert twice.judge[:-1] == once.judge
+    last = twice.judge[-1]
+    assert last.name == more.judge[-1].plan.name == again.PLAN.name
+    assert 0 < len(last.trees) <= again.PLAN.trees
+    cuts = [tree for tree in last.trees if isinstance(tree, tuple)]  # the others are constants
+    assert cuts
+    assert all(isinstance(leaf, float) for cut in cuts for leaf in cut[2:])
+
+
+def test_the_last_stage_needs_heads_and_others():
+    made, score = samples_of([1.0, 2.0], [1, 1], [16, 32])
+    assert again.fit_again(again.Peaks(made, score), ["cube5"], seed=0) is None
+
+
+def test_the_last_look_is_fitted_to_spoilt_views_and_written(evolved, monkeypatch):
+    folder, found, _ = evolved
+    monkeypatch.setattr(search, "keep_view", easy_view)
+    monkeypatch.setattr(search, "spoilt_looks", doubtful_looks)
+    monkeypatch.setattr(last_look, "LEAST_ROWS", 5)
+    monkeypatch.setattr(samples, "RANGE_M", 2.8)
+    said: list[str] = []
+    more = search._with_last_look(search.Settings(folder, 200, "easy"), found, said.append)
+    assert said[-1].startswith("looked again: ")
+    blunt, sharp = (load_cascade(str(folder / name)) for name in ("blunt.toml", "sharp.toml"))
+    assert blunt.relief is None
+    assert sharp.judge == blunt.judge
+    assert sharp.relief is not None
+    assert sharp.relief == more.relief
+    assert 0 < len(sharp.relief.spots) <= last_look.MOST_SPOTS
+    assert len(sharp.relief.trees) == last_look.TREES
+    asked = {name.rpartition(".")[0] for tree in sharp.relief.trees for name, _ in cuts(tree)}
+    assert asked == {spot.name for spot in sharp.relief.spots}
+
+
+def test_nothing_to_tell_apart_gives_no_last_look():
+    same = last_look.Looks(
+        np.zeros((9, 2 * len(last_look.SPOTS)), np.int16), np.ones(9, np.int8), np.zeros(9)
+    )
+    assert last_look.fit_relief(same, 0) is None
+    different = replace(same, label=np.arange(9, dtype=np.int8) % 2)
+    assert last_look.fit_relief(different, 0) is None  # of what is seen alike

@@ -1,36 +1,21 @@
-"""Nodes in processes of their own, and a robot in this one that knows nothing but standard messages."""
+"""Robots, nodes and frames that the tests of live nodes share."""
 
 from __future__ import annotations
 
-import array
 import os
 import signal
-import subprocess
-import sys
-import time
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, TransformStamped
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
-from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
-from std_msgs.msg import Header
-from tf2_msgs.msg import TFMessage
-from visualization_msgs.msg import MarkerArray
+from robot import NS, START_S, STEP, Process, Robot, stamp_of
 
 import headvox
 
 PACKAGE = Path(__file__).resolve().parents[2]
-NS = 1_000_000_000
-START_S = 240.0  # the first run of a new version compiles
-WAIT_S = 60.0  # far more than it takes: machines that test are busy
 
 
 def pytest_configure() -> None:
@@ -39,167 +24,15 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-class Process:
-    """A node of the package, in a process of its own."""
-
-    def __init__(self, module: str, *parameters: str, words: Sequence[str] = (), **environment: str) -> None:
-        command = [sys.executable, "-m", f"headvox_ros.{module}", *words]
-        if parameters:
-            command += ["--ros-args", *(part for parameter in parameters for part in ("-p", parameter))]
-        self.process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env={**os.environ, **environment},
-        )
-
-    @property
-    def pid(self) -> int:
-        return self.process.pid
-
-    def interrupt(self) -> None:
-        self.process.send_signal(signal.SIGINT)
-
-    def end(self) -> tuple[int, str]:
-        """Interrupt it, and return its exit code and everything that it said."""
-        if self.process.poll() is None:
-            self.interrupt()
-        return self.wait()
-
-    def wait(self, timeout_s: float = WAIT_S) -> tuple[int, str]:
-        try:
-            said, _ = self.process.communicate(timeout=timeout_s)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            said, _ = self.process.communicate()
-            pytest.fail(f"it does not end; it said:\n{said}")
-        return self.process.returncode, said
-
-
-class Robot:
-    """Publishes what drivers publish, and keeps what comes back."""
+class Time:
+    """Stamps that only go on, whoever asks."""
 
     def __init__(self) -> None:
-        self.node = rclpy.create_node("robot")
-        self.got: dict[str, list] = defaultdict(list)
-        self._out: dict[str, object] = {}
-        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._tf = self.node.create_publisher(TFMessage, "/tf", 100)
-        self._tf_static = self.node.create_publisher(TFMessage, "/tf_static", latched)
-        self.listen(DiagnosticArray, "/diagnostics")
-        self.listen(PoseArray, "/head_detector/poses")
-        self.listen(MarkerArray, "/head_detector/markers")
+        self.now = 1000 * NS
 
-    def listen(self, kind, topic: str, qos=10) -> None:
-        self.node.create_subscription(kind, topic, self.got[topic].append, qos)
-
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            rclpy.spin_once(self.node, timeout_sec=left)
-
-    def wait(self, happened, seconds: float = WAIT_S, meanwhile=None, every_s: float = 0.1):
-        """Spin until ``happened()`` is true, and return it; call ``meanwhile`` every so often."""
-        end = time.monotonic() + seconds
-        while not (result := happened()):
-            assert time.monotonic() < end, "it did not happen in time"
-            if meanwhile is not None:
-                meanwhile()
-            self.spin(every_s)
-        return result
-
-    def publish(self, topic: str, message) -> None:
-        kind = type(message)
-        if topic not in self._out:
-            self._out[topic] = self.node.create_publisher(kind, topic, QoSProfile(depth=2))
-            self.wait(lambda: self._out[topic].get_subscription_count() > 0, START_S)
-            self.spin(0.3)
-        self._out[topic].publish(message)
-
-    def place(self, child: str, T, stamp_ns: int = 0, parent: str = "world", static: bool = True) -> None:
-        moved = TransformStamped(header=header(parent, stamp_ns), child_frame_id=child)
-        t, q = moved.transform.translation, moved.transform.rotation
-        t.x, t.y, t.z = map(float, T[:3, 3])
-        q.x, q.y, q.z, q.w = map(float, Rotation.from_matrix(T[:3, :3]).as_quat())
-        (self._tf_static if static else self._tf).publish(TFMessage(transforms=[moved]))
-
-    def see(self, camera: str, image, stamp_ns: int, **changes) -> None:
-        """Publish a depth image with its camera_info, with some of its fields changed."""
-        lens = image.intrinsics
-        stamped = header(f"{camera}_optical", stamp_ns)
-        k = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
-        info = CameraInfo(header=stamped, width=lens.width, height=lens.height, k=k)
-        self.publish(f"/{camera}/camera_info", info)
-        height, width = image.depth.shape
-        message = Image(
-            header=stamped,
-            height=height,
-            width=width,
-            encoding="16UC1",
-            step=2 * width,
-            data=data_of(image.depth),
-        )
-        for name, value in changes.items():
-            setattr(message, name, value)
-        self.publish(f"/{camera}/image", message)
-
-    def poses(self) -> list[PoseArray]:
-        return self.got["/head_detector/poses"]
-
-    def status(self) -> dict[str, str]:
-        """The newest diagnostics: its rows, and its level and message."""
-        messages = self.got["/diagnostics"]
-        if not messages:
-            return {}
-        status = messages[-1].status[0]
-        return {
-            **{row.key: row.value for row in status.values},
-            "level": status.level[0],
-            "message": status.message,
-        }
-
-    def close(self) -> None:
-        self.node.destroy_node()
-
-
-def header(frame: str, stamp_ns: int) -> Header:
-    made = Header(frame_id=frame)
-    made.stamp.sec, made.stamp.nanosec = divmod(int(stamp_ns), NS)
-    return made
-
-
-def data_of(values) -> array.array:
-    data = array.array("B")
-    data.frombytes(np.ascontiguousarray(values).data.cast("B"))
-    return data
-
-
-def cloud_of(points, frame: str, stamp_ns: int, **changes) -> PointCloud2:
-    points = np.ascontiguousarray(points, dtype=np.float32)
-    fields = [
-        PointField(name=n, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, n in enumerate("xyz")
-    ]
-    message = PointCloud2(
-        header=header(frame, stamp_ns),
-        height=1,
-        width=len(points),
-        fields=fields,
-        point_step=12,
-        row_step=12 * len(points),
-        data=data_of(points) if len(points) else array.array("B"),
-    )
-    for name, value in changes.items():
-        setattr(message, name, value)
-    return message
-
-
-def xyz(pose) -> np.ndarray:
-    return np.array([pose.position.x, pose.position.y, pose.position.z])
-
-
-def stamp_of(message) -> int:
-    return message.header.stamp.sec * NS + message.header.stamp.nanosec
+    def next(self) -> int:
+        self.now += STEP
+        return self.now
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -245,3 +78,47 @@ def sample() -> Path:
 @pytest.fixture(scope="session")
 def frames(sample):
     return list(headvox.open_source(sample))
+
+
+@pytest.fixture(scope="module")
+def clock() -> Time:
+    return Time()
+
+
+@pytest.fixture(scope="module")
+def node(robot, start, frames):
+    """A node with two cameras and a LiDAR, all of which are placed."""
+    process = start(
+        "head_detector",
+        "depths:=['/left/image','/right/image']",
+        "clouds:=['/lidar/points']",
+        "target_frame:=world",
+        "sensor_timeout_s:=3.0",
+        "sync_wait_s:=1.0",  # this process may be slow
+        "tf_wait_s:=1.0",
+        "tracking:=false",  # so that every frame is by itself
+        "reliability:=reliable",
+    )
+    for image in frames[0].depths:
+        robot.place(f"{image.name}_optical", image.T_world_camera)
+    robot.place("lidar", np.eye(4))
+    robot.wait(lambda: robot.node.count_subscribers("/left/image") > 0, START_S)
+    yield process
+    code, said = process.end()
+    assert code == 0, said
+    assert "Traceback" not in said, said
+
+
+@pytest.fixture
+def settled(robot, node, frames, clock):
+    """Both cameras deliver, and the node is well: where every test begins and ends."""
+
+    def well():
+        robot.see_frame(frames[0], clock.next())
+        return robot.poses() and stamp_of(robot.poses()[-1]) >= clock.now - STEP
+
+    robot.wait(well)
+    for messages in robot.got.values():
+        messages.clear()
+    yield robot
+    robot.wait(well)

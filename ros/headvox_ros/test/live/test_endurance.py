@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from conftest import START_S
+from robot import START_S
 
 FRAMES = 400
 FRAME_MB = 2 * 424 * 240 * 2e-6  # of the sample

@@ -6,9 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from conftest import NS, START_S, stamp_of, xyz
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray
+from robot import NS, START_S, stamp_of, xyz
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from vision_msgs.msg import Detection3DArray

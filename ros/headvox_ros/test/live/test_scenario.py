@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from conftest import NS, START_S
+from robot import NS, START_S
 
 from headvox.parallel.workers import Workers
 from headvox.synth.camera import d435i

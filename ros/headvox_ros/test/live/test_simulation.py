@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import NS, START_S, stamp_of, xyz
 from geometry_msgs.msg import PoseArray
+from robot import NS, START_S, stamp_of, xyz
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 

@@ -1,5 +1,8 @@
+import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
+from pathlib import Path
 
 import pytest
 
@@ -47,3 +50,31 @@ def test_the_version_is_the_packages():
     from importlib.metadata import version
 
     assert headvox.__version__ == version("headvox")
+
+
+def imported_by(node: ast.AST) -> set[str]:
+    """Return what code imports, in functions too; what only a type checker sees does not count."""
+    found = set()
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ImportFrom):
+            found |= {f"{child.module}.{name.name}" for name in child.names}
+        elif isinstance(child, ast.Import):
+            found |= {name.name for name in child.names}
+        elif not (isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"):
+            found |= imported_by(child)
+    return found
+
+
+def test_no_two_modules_need_each_other():
+    package = Path(headvox.__file__).parent
+    trees = {}
+    for path in package.rglob("*.py"):
+        parts = path.relative_to(package.parent).with_suffix("").parts
+        module = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        trees[module] = ast.parse(path.read_text(encoding="utf-8"))
+    needs = {
+        module: {name if name in trees else name.rpartition(".")[0] for name in imported_by(tree)}
+        for module, tree in trees.items()
+    }
+    assert needs["headvox.sources.ply"] >= {"headvox.sources.content", "numpy"}
+    TopologicalSorter(needs).prepare()  # raises CycleError, which names them

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from headvox.data import Track
-from headvox.sinks import Result
 from headvox.sinks.jsonl import DIGITS, METRE_DIGITS, number
 from headvox.sinks.linefile import LineFile
+from headvox.sinks.result import Result
 
 COLUMNS = (
     "frame", "stamp_ns", "latency_ms", "id", "x", "y", "z", "qx", "qy", "qz", "qw", "radius", "score",

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TextIO
 
 from headvox.data import Track
-from headvox.sinks import Result
 from headvox.sinks.linefile import LineFile
+from headvox.sinks.result import Result
 
 METRE_DIGITS = 4  # 0.1 mm, far below what any depth camera can tell
 DEGREE_DIGITS = 2

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from headvox.ros import outputs
 from headvox.ros.mcapfile import McapFile
-from headvox.sinks import Result
+from headvox.sinks.result import Result
 
 NODE = "/head_detector"
 _LIFETIME_S = 0.5

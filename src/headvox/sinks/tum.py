@@ -7,9 +7,9 @@ from pathlib import Path
 
 from headvox.data import Track
 from headvox.errors import HeadvoxError
-from headvox.sinks import Result
 from headvox.sinks.jsonl import DIGITS, METRE_DIGITS
 from headvox.sinks.linefile import LineFile
+from headvox.sinks.result import Result
 
 
 class TumFiles:

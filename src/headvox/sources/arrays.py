@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from headvox.errors import HeadvoxError
 from headvox.sources.check import as_points
-from headvox.sources.cloudfile import CloudFile
+from headvox.sources.content import CloudFile
 
 KEY = "points"
 _MAX_COLUMNS = 64  # more, and it is an image or a transposed cloud

@@ -15,7 +15,8 @@ from headvox.errors import HeadvoxError
 from headvox.frames import transform, unproject
 from headvox.sources import Source, open_source
 from headvox.sources.bag import BagSource
-from headvox.sources.cloudfile import CloudFile, CloudFileSource, read_cloud_file
+from headvox.sources.cloudfile import CloudFileSource, read_cloud_file
+from headvox.sources.content import CloudFile
 from headvox.sources.folder import FRAME_NS, FolderSource
 from headvox.sources.options import SourceOptions, listed
 from headvox.sources.realsense import RealSenseFile

@@ -13,7 +13,7 @@ from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.sources import lzf
 from headvox.sources.check import Column, as_points
-from headvox.sources.cloudfile import CloudFile
+from headvox.sources.content import CloudFile
 from headvox.sources.text import parse_numbers
 
 _MAX_HEADER_BYTES = 1 << 16

@@ -15,7 +15,7 @@ from headvox.data import F32, I64
 from headvox.errors import HeadvoxError
 from headvox.mesh import sample_surface, triangulate
 from headvox.sources.check import Column, as_points, check_cloud
-from headvox.sources.cloudfile import CloudFile
+from headvox.sources.content import CloudFile
 from headvox.sources.text import parse_numbers
 
 _TYPES = {

@@ -7,42 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
-from typing import Any, Protocol, cast
+from typing import Any
 
 import numpy as np
 
 from headvox.data import F64
 from headvox.synth.floorplan import FloorPlan, footprint
 from headvox.synth.furniture import Item, bed, chair, pick, sofa, table
+from headvox.synth.makers import People
 from headvox.synth.motion import RATE_HZ, Moment, live
 from headvox.synth.people import PosedBody
-from headvox.synth.poses import Pose
 from headvox.synth.room import ON_TABLES, Room
 
 Rng = np.random.Generator
-
-
-class People(Protocol):
-    """What a scene asks of a module that makes people: :mod:`.people`, or the quick :mod:`.mannequin`."""
-
-    def sample_person(self, rng: Rng, child_share: float = ...) -> Any:
-        """Draw a person."""
-        ...
-
-    def sample_pose(self, rng: Rng, posture: str | None = ...) -> Pose:
-        """Draw a pose."""
-        ...
-
-    def walking_pose(self, phase_rad: float) -> Pose:
-        """Return the pose at a phase of the gait."""
-        ...
-
-    def pose_person(
-        self, person: Any, pose: Pose, xy: tuple[float, float], heading_rad: float, floor_z: float
-    ) -> PosedBody:
-        """Return the triangles of a person in a pose."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +36,6 @@ class Actor:
         step = min(round(stamp_ns * RATE_HZ * 1e-9), len(self.moments) - 1)
         moment = self.moments[step]
         return people.pose_person(self.person, moment.pose, moment.xy, moment.heading_rad, moment.floor_z)
-
-
-def real_people() -> People:
-    """The module that makes the realistic people."""
-    return cast(People, import_module("headvox.synth.people"))
 
 
 def place_person(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +17,8 @@ from scipy import ndimage
 from headvox.data import F64
 from headvox.errors import HeadvoxError
 from headvox.synth.floorplan import CELL_M, FloorPlan
+from headvox.synth.makers import People
 from headvox.synth.poses import Pose
-
-if TYPE_CHECKING:
-    from headvox.synth.actors import People
 
 Rng = np.random.Generator
 Mask = npt.NDArray[np.bool_]

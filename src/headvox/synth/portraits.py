@@ -8,9 +8,10 @@ import numpy as np
 
 from headvox.data import F64, Frame
 from headvox.errors import HeadvoxError
-from headvox.synth.actors import People, place_person, real_people
+from headvox.synth.actors import place_person
 from headvox.synth.camera import d435i
 from headvox.synth.floorplan import rectangle
+from headvox.synth.makers import People, real_people
 from headvox.synth.mounts import Camera, camera_pose, lens
 from headvox.synth.people import Person
 from headvox.synth.room import sample_room

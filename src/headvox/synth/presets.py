@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from headvox.data import F64, Intrinsics
 from headvox.errors import HeadvoxError
-from headvox.synth.actors import Actor, People, animated, place_person, real_people
+from headvox.synth.actors import Actor, animated, place_person
 from headvox.synth.camera import IDEAL, Lidar, Sensor, d435i
 from headvox.synth.floorplan import FloorPlan, rectangle
+from headvox.synth.makers import People, real_people
 from headvox.synth.motion import RATE_HZ, turning
 from headvox.synth.mounts import Camera, PlacedLidar, camera_pose, lens
 from headvox.synth.room import sample_room

@@ -26,8 +26,8 @@ from headvox.data import U16, Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.parallel.workers import ALONE, Workers
 from headvox.sources.folder import FRAME_NS
-from headvox.synth.actors import People
 from headvox.synth.camera import d435i
+from headvox.synth.makers import People
 from headvox.synth.presets import two_cameras
 from headvox.synth.scene import Scene, TrueHead
 

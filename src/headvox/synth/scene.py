@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from headvox.data import F32, F64, U16, Cloud, DepthImage, Frame, Intrinsics
 from headvox.frames import inverse, transform
-from headvox.synth.actors import Actor, People, animated, place_person, real_people
+from headvox.synth.actors import Actor, animated, place_person
 from headvox.synth.camera import Sensor, measure, sweep
+from headvox.synth.makers import People, real_people
 from headvox.synth.motion import sample_act
 from headvox.synth.mounts import Camera, PlacedLidar, sample_camera_pose, sample_device
 from headvox.synth.rays import NEAR_M, Mesh, View, join, look, spin

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from headvox.data import Cloud, DepthImage, Intrinsics
 from headvox.fuse import Region
@@ -135,14 +136,7 @@ def region(radius: float = 0.6, low: float = -0.3, high: float = 0.5, centre=(0.
 
 def turn(rng: np.random.Generator) -> np.ndarray:
     """Return a random rotation (3, 3)."""
-    x, y, z, w = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(rng.normal(size=4)).as_matrix()
 
 
 def pose(rng: np.random.Generator, reach: float = 0.3) -> np.ndarray:

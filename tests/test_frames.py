@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 import scenes
+from scipy.spatial.transform import Rotation
 
 from headvox.errors import HeadvoxError
-from headvox.frames import as_rigid, inverse, transform
+from headvox.frames import as_rigid, inverse, placed, transform
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -14,6 +15,21 @@ def test_inverse_undoes_a_transform(seed):
     np.testing.assert_allclose(transform(inverse(T), transform(T, points)), points, atol=1e-12)
     np.testing.assert_allclose(inverse(T) @ T, np.eye(4), atol=1e-12)
     np.testing.assert_allclose(transform(T, points), (np.c_[points, np.ones(20)] @ T.T)[:, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_place_and_a_quaternion_are_a_transform(seed):
+    rng = np.random.default_rng(seed)
+    where, quaternion = rng.normal(size=3), 3.0 * rng.normal(size=4)
+    T = as_rigid(placed(where, quaternion), "T")
+    np.testing.assert_allclose(T[:3, :3], Rotation.from_quat(quaternion).as_matrix(), atol=1e-15)
+    assert T[:3, 3].tolist() == where.tolist()
+    assert placed((1, 2, 3), (0, 0, 0, -1)).tolist() == [
+        [1, 0, 0, 1],
+        [0, 1, 0, 2],
+        [0, 0, 1, 3],
+        [0, 0, 0, 1],
+    ]
 
 
 def changed(row, column, value):

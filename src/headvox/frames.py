@@ -71,6 +71,20 @@ def _is_rotation(a: list[float], b: list[float], c: list[float]) -> bool:
     return max(map(abs, off)) <= RIGID_TOLERANCE and determinant > 0.0
 
 
+def placed(translation: npt.ArrayLike, quaternion: npt.ArrayLike) -> F64:
+    """Return T_a_b of where b is in a: metres, and x, y, z, w of any length but 0."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    x, y, z, w = (q / np.linalg.norm(q)).tolist()
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = translation
+    return T
+
+
 def inverse(T_a_b: F64) -> F64:
     """Return T_b_a of a rigid T_a_b."""
     T_b_a = np.eye(4)

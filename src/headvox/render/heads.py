@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from headvox.data import F64, Intrinsics, State, Track
-from headvox.frames import inverse, transform
+from headvox.frames import inverse, placed, transform
 from headvox.render.colours import GROUND, INK, PALE, RGB, of_head
 
 SIZE_M = np.array([0.20, 0.16, 0.25])
@@ -53,7 +53,7 @@ class Overlay:
             self._name(str(track.id), track.centre + ABOVE_M, colour)
 
     def _box(self, track: Track, colour: RGB, lost: bool) -> None:
-        T_world_head = _pose(track)
+        T_world_head = placed(track.centre, track.quaternion)
         corners = self._pixels(transform(T_world_head, CORNERS))
         nose = self._pixels(transform(T_world_head, NOSE))
         if corners is None or nose is None:
@@ -152,16 +152,3 @@ class Overlay:
         camera = self._camera
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         return (np.stack([u, v], axis=1) + 0.5) * self._scale
-
-
-def _pose(track: Track) -> F64:
-    """Return T_world_head."""
-    x, y, z, w = track.quaternion
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = track.centre
-    return T

@@ -18,7 +18,7 @@ import numpy as np
 
 from headvox.data import F64
 from headvox.errors import HeadvoxError
-from headvox.frames import inverse
+from headvox.frames import inverse, placed
 
 NS = 1_000_000_000
 UNIT_TOLERANCE = 0.01  # how far a quaternion's length may be from 1: as tf2
@@ -203,7 +203,7 @@ def _name(frame: str) -> str:
 def _at(child: str, edge: _Edge, stamp_ns: int) -> F64:
     """Return T_parent_child at a time: linear between two translations, along the arc between two rotations."""
     if edge.is_static:
-        return _matrix(*edge.places[0])
+        return placed(*edge.places[0])
     first, last = edge.stamps[0], edge.stamps[-1]
     if stamp_ns > last:
         what = (
@@ -217,11 +217,11 @@ def _at(child: str, edge: _Edge, stamp_ns: int) -> F64:
         raise NoTransform(what, "Has it just begun?", hopeless=True)
     at = bisect_left(edge.stamps, stamp_ns)
     if edge.stamps[at] == stamp_ns:
-        return _matrix(*edge.places[at])
+        return placed(*edge.places[at])
     share = (stamp_ns - edge.stamps[at - 1]) / (edge.stamps[at] - edge.stamps[at - 1])
     (from_translation, from_quaternion), (to_translation, to_quaternion) = edge.places[at - 1 : at + 1]
     translation = (1.0 - share) * from_translation + share * to_translation
-    return _matrix(translation, _slerp(from_quaternion, to_quaternion, share))
+    return placed(translation, _slerp(from_quaternion, to_quaternion, share))
 
 
 def _slerp(a: F64, b: F64, share: float) -> F64:
@@ -233,15 +233,3 @@ def _slerp(a: F64, b: F64, share: float) -> F64:
         return (1.0 - share) * a + share * b
     mixed: F64 = (np.sin((1.0 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
     return mixed
-
-
-def _matrix(translation: F64, quaternion: F64) -> F64:
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = translation
-    return T

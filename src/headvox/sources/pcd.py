@@ -10,7 +10,7 @@ import numpy as np
 
 from headvox.data import F64
 from headvox.errors import HeadvoxError
-from headvox.frames import as_rigid
+from headvox.frames import as_rigid, placed
 from headvox.sources import lzf
 from headvox.sources.check import Column, as_points
 from headvox.sources.content import CloudFile
@@ -169,16 +169,7 @@ def _viewpoint(entries: dict[str, list[str]], name: str) -> F64 | None:
             f"{name}: the quaternion of VIEWPOINT has the norm {norm2**0.5:.3g}, expected 1.",
             "Write VIEWPOINT 0 0 0 1 0 0 0 for a cloud that is in the world frame.",
         )
-    s = 2.0 / norm2
-    T_world_sensor = as_rigid(
-        [
-            [1 - s * (qy * qy + qz * qz), s * (qx * qy - qw * qz), s * (qx * qz + qw * qy), x],
-            [s * (qx * qy + qw * qz), 1 - s * (qx * qx + qz * qz), s * (qy * qz - qw * qx), y],
-            [s * (qx * qz - qw * qy), s * (qy * qz + qw * qx), 1 - s * (qx * qx + qy * qy), z],
-            [0.0, 0.0, 0.0, 1.0],
-        ],
-        f"{name}: VIEWPOINT",
-    )
+    T_world_sensor = as_rigid(placed((x, y, z), (qx, qy, qz, qw)), f"{name}: VIEWPOINT")
     return None if np.array_equal(T_world_sensor, np.eye(4)) else T_world_sensor
 
 

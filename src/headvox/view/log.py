@@ -12,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from headvox.data import F64, DepthImage, Frame, State, Track
-from headvox.frames import transform
+from headvox.frames import placed, transform
 from headvox.render.colours import of_head
 from headvox.render.heads import SIZE_M
 from headvox.render.scene import points_of, viewpoint_for
@@ -114,7 +114,7 @@ class Log:
                 labels=[_label(t) for t in turned],
             ),
         )  # fmt: skip
-        ahead = [_forward(track.quaternion) * NOSE_M for track in turned]
+        ahead = [placed(track.centre, track.quaternion)[:3, 0] * NOSE_M for track in turned]
         self._to.log(
             "world/heads/looking",
             rr.Arrows3D(
@@ -160,12 +160,6 @@ def _colour(track: Track) -> tuple[int, int, int, int]:
 
 def _label(track: Track) -> str:
     return f"{track.id or '?'}"
-
-
-def _forward(quaternion: F64) -> F64:
-    """Return the x axis of a head in the world."""
-    x, y, z, w = quaternion
-    return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
 
 
 def _by_height(points: np.ndarray) -> np.ndarray:

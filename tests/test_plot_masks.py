@@ -166,4 +166,4 @@ def test_without_matplotlib_the_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["masks", "plot", "paper", "-o", str(tmp_path)]) == 1
-    assert 'pip install "headvox[plot]"' in capsys.readouterr().err
+    assert "pip install 'headvox[plot]'" in capsys.readouterr().err

@@ -186,6 +186,10 @@ def test_the_command_line_of_a_batch(recordings, tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["rig0.jsonl", "rig1.jsonl"]
     assert headvox("run", *recordings[:2]).returncode == 2
     assert headvox("run", recordings[0], "--into", "out", "--json").returncode == 2
+    for flags in (("--workers", 2), ("--scheduler", "local")):
+        done = headvox("run", recordings[0], *flags)
+        assert done.returncode == 2
+        assert "go with --into DIR" in done.stderr
 
 
 def test_a_cluster_makes_the_same_recording(recordings, tmp_path):

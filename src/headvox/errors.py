@@ -1,4 +1,4 @@
-"""The one exception the library raises for input it cannot use."""
+"""What the library raises for what it cannot use."""
 
 from __future__ import annotations
 
@@ -30,3 +30,12 @@ class Undecided(HeadvoxError):
     def __init__(self, what: str, do: str, choices: Sequence[str] = ()) -> None:
         super().__init__(what, do)
         self.choices = tuple(choices)
+
+
+class MissingExtra(HeadvoxError):
+    """A package is not installed that comes with an ``extra`` of headvox; ``instead`` is what goes without it."""
+
+    def __init__(self, what: str, extra: str, instead: str = "") -> None:
+        super().__init__(
+            what, f"Run: pip install 'headvox[{extra}]'" + (f", or {instead}" if instead else "")
+        )

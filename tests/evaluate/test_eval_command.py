@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -238,6 +239,15 @@ def test_heads_in_a_frame_that_cannot_be_read_are_missed(
     assert "damaged: 1 of 6 frames could not be used" in captured.err
     assert found["damaged"]["heads"] == found["six"]["heads"] == 17
     assert found["six"]["found"] - 3 <= found["damaged"]["found"] < found["six"]["found"]
+
+
+def test_without_motmetrics_nothing_is_begun_that_needs_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "motmetrics", None)
+    monkeypatch.setattr("headvox.evaluate.command._show", lambda *_: pytest.fail("a frame was looked at"))
+    assert main(["eval", "rotation"]) == 1
+    assert "pip install 'headvox[eval]'" in capsys.readouterr().err
 
 
 def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -26,6 +27,15 @@ def test_a_folder_of_another_seed_is_not_mixed(tmp_path):
     (tmp_path / "search.json").write_text(json.dumps({"format": "headvox-search", "version": 1, "seed": 4}))
     with pytest.raises(HeadvoxError, match="another seed"):
         search.evolve(search.Settings(tmp_path, 200, seed=5), print)
+
+
+@pytest.mark.parametrize("library", ["lightgbm", "cmaes"])
+def test_what_is_missing_is_named_before_any_view_is_made(tmp_path, monkeypatch, capsys, library):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, library, None)
+    assert main(["masks", "evolve"]) == 1
+    assert "pip install 'headvox[evolve]'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_bad_commands_end_before_any_work(tmp_path, monkeypatch, capsys):

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from cloud_writers import POINTS, SQUARE, npy, npz, pcd, ply, recording
+from PIL import Image
 
 from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
@@ -110,6 +111,13 @@ def test_missing_and_unreadable_things_are_refused(tmp_path):
     for name in ("x\0y", "x" * 5000):
         with pytest.raises(HeadvoxError, match=r"cannot be read|no such file"):
             open_source(tmp_path / name)
+
+
+def test_images_alone_are_told_what_they_lack(tmp_path):
+    Image.fromarray(np.full((2, 2), 1000, np.uint16)).save(tmp_path / "000000.png")
+    for place in (tmp_path, tmp_path / "000000.png"):
+        with pytest.raises(HeadvoxError, match=r"Depth images need a recording\.json"):
+            open_source(place)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes exist on Unix only")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from headvox.commands.flags import GOOD, add_command
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 
 if TYPE_CHECKING:
     from headvox.commands.flags import Commands
@@ -29,7 +29,7 @@ def _completion(args: argparse.Namespace) -> int:
     try:
         import shtab
     except ImportError:
-        raise HeadvoxError("Completion needs shtab.", "pip install 'headvox[completion]'") from None
+        raise MissingExtra("Completion needs shtab.", "completion") from None
     if args.shell not in shtab.SUPPORTED_SHELLS:
         raise HeadvoxError(f"This shtab knows no {args.shell}.", "pip install -U shtab")
     print(shtab.complete(args.whole_parser(), args.shell))

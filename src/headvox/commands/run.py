@@ -26,7 +26,7 @@ from headvox.commands.flags import (
     tracker_config_of,
 )
 from headvox.commands.table import table
-from headvox.parallel.workers import add_flags, of_flags
+from headvox.parallel.workers import ALONE, add_flags, of_flags
 from headvox.sinks import SUFFIXES
 
 if TYPE_CHECKING:
@@ -81,6 +81,8 @@ def _run(args: argparse.Namespace) -> int:
         return _run_batch(args)
     if args.more:
         raise UsageError("several sources go with --into DIR, which gets a file of each")
+    if of_flags(args) != ALONE:
+        raise UsageError("--workers and --scheduler go with --into DIR: they share several sources out")
     if args.no_track and args.output is not None and args.output.suffix == ".tum":
         raise UsageError("-o NAME.tum writes a file a track: it does not go with --no-track")
     from headvox.commands.session import opened

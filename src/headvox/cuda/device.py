@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from headvox.cuda.readings import Asked, Found
 from headvox.data import DepthImage
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 from headvox.masks.compile import CompiledCascade
 from headvox.voxelize import Lattice, Rays
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from headvox.cuda.search import Search
 
 BATCH = 8  # frames that go at once, where several are known
-INSTALL = "Install numba-cuda with: pip install 'headvox[cuda]', or use the backend \"cpu\"."
 
 
 class DeviceLost(Exception):
@@ -41,7 +40,11 @@ def check_device() -> None:
         HeadvoxError: numba-cuda is missing, there is no GPU, or its driver is too old.
     """
     if importlib.util.find_spec("numba_cuda") is None:
-        raise HeadvoxError('The backend "cuda" needs numba-cuda, which is not installed.', INSTALL)
+        raise MissingExtra(
+            'The backend "cuda" needs numba-cuda, which is not installed.',
+            "cuda",
+            instead='use the backend "cpu".',
+        )
     try:
         from numba import cuda
 

@@ -91,6 +91,7 @@ def _report(args: argparse.Namespace) -> int:
     from headvox.evaluate.outcome import evaluate, evaluate_all, pooled
     from headvox.evaluate.plots import need_matplotlib
     from headvox.evaluate.report import Report
+    from headvox.evaluate.tracking import need_motmetrics
     from headvox.evaluate.truth import NO_ID
 
     plan = _plan(args)
@@ -102,6 +103,8 @@ def _report(args: argparse.Namespace) -> int:
     recorded: dict[str, list[Outcome]] = {}
     with closing(Live(sys.stderr, None)) as live:
         scenarios = _scenarios(args, live)
+        if plan.tracker is not None and any(scenario.synthetic and scenario.moving for scenario in scenarios):
+            need_motmetrics()  # these have ids
         if args.scheduler is None:
             # One after the other, each told of as it goes: whoever times a detector has the machine to himself.
             outcomes: Iterable[tuple[Scenario, list[Outcome]]] = (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from headvox.data import F64
-from headvox.errors import HeadvoxError
+from headvox.errors import MissingExtra
 from headvox.evaluate.match import Rules
 from headvox.evaluate.metrics import Rows, gather, match_frames
 from headvox.evaluate.scores import Scores
@@ -30,10 +30,7 @@ def need_matplotlib() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError:
-        raise HeadvoxError(
-            "Plots and pictures need matplotlib; report.json is written.",
-            'Install it: pip install "headvox[plot]"',
-        ) from None
+        raise MissingExtra("Plots and pictures need matplotlib.", "plot") from None
 
 
 def plot_scenario(runs: Sequence[tuple[Scores, Run]], rules: Rules, path: Path) -> None:

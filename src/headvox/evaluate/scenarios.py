@@ -163,7 +163,10 @@ def recording(path: Path) -> Scenario:
 
 def _truth_of(path: Path) -> dict[int, TrueHeads]:
     if not path.exists():
-        raise HeadvoxError(f"{path}: there is no such file or folder.", "Check the path.")
+        raise HeadvoxError(
+            f"{path}: there is no such file or folder.",
+            "Check the path; the scenarios are static, rotation, two-cameras, peers, sample and all.",
+        )
     folder = path if path.is_dir() else path.parent
     if not (folder / FILE).is_file():
         raise HeadvoxError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from headvox.data import F64, I64
-from headvox.errors import HeadvoxError
+from headvox.errors import MissingExtra
 from headvox.evaluate.match import Match, Rules, match
 from headvox.evaluate.metrics import Sample, counted
 from headvox.evaluate.truth import NO_ID
@@ -52,6 +53,14 @@ class TrackingScores:
     coasted: float | None
 
 
+def need_motmetrics() -> None:
+    """Raise HeadvoxError where motmetrics is not installed."""
+    if importlib.util.find_spec("motmetrics") is None:
+        raise MissingExtra(
+            "Figures of tracking need motmetrics.", "eval", instead="leave them out: --no-track"
+        )
+
+
 def score_tracks(samples: Sequence[Sample], rules: Rules) -> TrackingScores | None:
     """Return the figures, or None where heads have no ids or nothing that was found has one.
 
@@ -89,13 +98,9 @@ def clear_mot(frames: Sequence[Tracks], radius_m: float) -> dict[str, Any]:
     Raises:
         HeadvoxError: motmetrics is not installed.
     """
-    try:
-        import motmetrics
-    except ImportError:
-        raise HeadvoxError(
-            "Figures of tracking need motmetrics.",
-            "pip install 'headvox[eval]', or -e '.[eval]' in a checkout.",
-        ) from None
+    need_motmetrics()
+    import motmetrics
+
     events = motmetrics.MOTAccumulator(auto_id=True)
     for frame in frames:
         events.update(frame.true_ids, frame.found_ids, np.where(frame.away <= radius_m, frame.away, np.nan))

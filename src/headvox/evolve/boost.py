@@ -150,17 +150,9 @@ def train(
     features: npt.NDArray[np.float32], label: npt.NDArray[np.int8], start: F64 | None, weight: F64 | None, trees: int,
     rate: float, share: float, seed: int, other: dict[str, int] | None = None,
 ) -> Any:  # fmt: skip
-    """Return LightGBM's model of rows of ``features`` (N, F): see :func:`fit`.
+    """Return LightGBM's model of rows of ``features`` (N, F): see :func:`fit`."""
+    import lightgbm
 
-    Raises:
-        HeadvoxError: the library is missing.
-    """
-    try:
-        import lightgbm
-    except ImportError:
-        raise HeadvoxError(
-            "The search for a cascade needs LightGBM.", "pip install 'headvox[evolve]'"
-        ) from None
     data = lightgbm.Dataset(features, label, init_score=start, weight=weight)
     settings = {
         "objective": "binary", "num_leaves": 8, "max_depth": 4, "learning_rate": rate, "min_data_in_leaf": 40,

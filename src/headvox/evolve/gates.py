@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.data import F64
-from headvox.errors import HeadvoxError
 from headvox.evolve.bank import GATE
 from headvox.evolve.samples import I64, GateSums
 from headvox.masks.cascade import Condition
@@ -37,10 +36,8 @@ def find_limits(sums: GateSums, lost: float, seed: int, bags: I64 | None = None)
 
     ``bags``, if given, are the heads that count: those that the rest of the cascade accepts.
     """
-    try:
-        from cmaes import CMA
-    except ImportError:
-        raise HeadvoxError("The search for a gate needs cmaes.", "pip install 'headvox[evolve]'") from None
+    from cmaes import CMA
+
     heads = sums.bag >= 0 if bags is None else np.isin(sums.bag, bags)
     values, (_, bag) = sums.sums[heads], np.unique(sums.bag[heads], return_inverse=True)
     others = sums.sums[sums.bag < 0][:OTHERS]

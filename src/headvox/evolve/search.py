@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 from headvox.evolve import boost, gates
 from headvox.evolve.again import Peaks, fit_again, spoilt_peaks
 from headvox.evolve.bank import SUBDIVISION, VOXEL_M
@@ -73,6 +73,7 @@ def evolve(settings: Settings, say: Say) -> Found:
     Raises:
         HeadvoxError: the folder holds views of another seed, too few views, or a library is missing.
     """
+    _need_libraries()
     _claim(settings)
     sums = gates.join_sums([s for s in _of_views(settings, GateSums.of, GATE_VIEWS) if s is not None])
     limits = gates.find_limits(sums, GATE_LOSES, settings.seed)
@@ -159,6 +160,15 @@ def _with_verification(settings: Settings, found: Found, say: Say) -> Found:
         return found
     say(f"verification: a unit of misfit costs {rule.misfit:g}, a centimetre of radius {rule.radius / 100:g}")
     return replace(found, verification=rule)
+
+
+def _need_libraries() -> None:
+    """Say now what would be missed only when the views are made, which takes hours."""
+    try:
+        import cmaes  # noqa: F401
+        import lightgbm  # noqa: F401
+    except (ImportError, OSError) as error:  # OSError: LightGBM finds no OpenMP
+        raise MissingExtra(f"The search for a cascade needs LightGBM and cmaes: {error}.", "evolve") from None
 
 
 def _claim(settings: Settings) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from headvox.commands.table import printable
 from headvox.data import F64
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 from headvox.masks.cascade import Cascade
 from headvox.masks.pictures import GREEN, RED, Painted, Picture, influence_of_features, pictures_of
 
@@ -66,7 +66,7 @@ def _need_matplotlib() -> None:
     try:
         import matplotlib
     except ImportError:
-        raise HeadvoxError("Pictures need matplotlib.", 'Install it: pip install "headvox[plot]"') from None
+        raise MissingExtra("Pictures need matplotlib.", "plot") from None
     matplotlib.use("Agg")
 
 

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from headvox import __version__
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -95,9 +95,7 @@ def _client(scheduler: str, count: int) -> Iterator[Client]:
     try:
         import distributed
     except ImportError:
-        raise HeadvoxError(
-            "--scheduler needs Dask, which is not installed.", "pip install 'headvox[cluster]'"
-        ) from None
+        raise MissingExtra("--scheduler needs Dask, which is not installed.", "cluster") from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is raised
     with ExitStack() as stack:
         if scheduler == "local":

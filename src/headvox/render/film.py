@@ -19,7 +19,7 @@ from typing import IO
 import numpy as np
 from PIL import Image
 
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 from headvox.render.colours import DEPTH, FAINT, FLOOR, GROUND, HEADS, HEIGHT, INK, NOTHING
 
 SUFFIXES = (".gif", ".mp4", ".png")
@@ -235,6 +235,4 @@ def _ffmpeg() -> str:
 
         return str(get_ffmpeg_exe())
     except (ImportError, RuntimeError):
-        raise HeadvoxError(
-            "An mp4 needs imageio-ffmpeg.", "pip install 'headvox[view]', or write a gif."
-        ) from None
+        raise MissingExtra("An mp4 needs imageio-ffmpeg.", "view", instead="write a gif.") from None

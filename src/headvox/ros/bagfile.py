@@ -15,9 +15,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO
 
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 
-INSTALL = "pip install 'headvox[bag]'"
 IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the second is that of the first years of ROS 1
@@ -176,7 +175,7 @@ def _rosbags() -> SimpleNamespace:
         from rosbags.rosbag2 import reader as reader2
         from rosbags.rosbag2 import storage_mcap, storage_sqlite3
     except ImportError as error:
-        raise HeadvoxError(f"Bags need the package {error.name or 'rosbags'!r}.", f"Run: {INSTALL}") from None
+        raise MissingExtra(f"Bags need the package {error.name or 'rosbags'!r}.", "bag") from None
     _bound(reader1.decompressors, storage_mcap.DECOMPRESSORS, reader2)
     ros1 = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     for name in TRANSFORMS:

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from headvox.errors import HeadvoxError
-from headvox.ros.bagfile import INSTALL
+from headvox.errors import HeadvoxError, MissingExtra
 from headvox.ros.outputs import Content
 
 CHUNK_BYTES = 256 << 10  # what is lost at most when the process is killed
@@ -41,7 +40,7 @@ class McapFile:
             from rosbags import typesys
         except ImportError as error:
             name = (error.name or "mcap").partition(".")[0]
-            raise HeadvoxError(f"MCAP files need the package {name!r}.", f"Run: {INSTALL}") from None
+            raise MissingExtra(f"MCAP files need the package {name!r}.", "bag") from None
         self.path = path
         self._store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         for name, definition in _VISION.items():

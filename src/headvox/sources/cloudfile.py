@@ -11,7 +11,11 @@ from headvox.sources.check import check_cloud
 from headvox.sources.content import CloudFile
 
 MAX_FILE_BYTES = 4 << 30
+PNG = b"\x89PNG"
 SUFFIXES = (".ply", ".pcd", ".npy", ".npz")
+OF_DEPTH = (
+    'Depth images need a recording.json, with camera and pose: see "Depth recordings" in docs/conventions.md.'
+)
 
 
 class CloudFileSource:
@@ -96,10 +100,13 @@ def _reader(head: bytes, name: str) -> Callable[[bytes, str], CloudFile]:
         from headvox.sources.pcd import read_pcd
 
         return read_pcd
+    expected = "expected a bag, or a ply, pcd, npy or npz file"
+    if head.startswith(PNG):
+        raise HeadvoxError(f"{name}: {expected}, it is a PNG image.", OF_DEPTH)
     raise HeadvoxError(
-        f"{name}: expected a bag, or a ply, pcd, npy or npz file, it begins with {head[:12]!r}."
+        f"{name}: {expected}, it begins with {head[:12]!r}."
         if head
-        else f"{name}: the file is empty, expected a bag, or a ply, pcd, npy or npz file.",
+        else f"{name}: the file is empty, {expected}.",
         "Convert it to one of these, or give the folder of a recording.",
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
-from headvox.sources.cloudfile import SUFFIXES, read_cloud
+from headvox.sources.cloudfile import OF_DEPTH, SUFFIXES, read_cloud
 
 FRAME_NS = 33_333_333  # files have no stamps: they are taken to be 30 a second
 
@@ -65,9 +65,10 @@ def _cloud_paths(folder: Path) -> list[Path]:
             f"{folder}: cannot be read: {error.strerror}.", "Check the path and its permissions."
         ) from None
     if not paths:
+        has_images = any(folder.glob("*.png"))
         raise HeadvoxError(
             f"{folder}: the folder holds neither recording.json nor any file that ends in "
             f"{', '.join(SUFFIXES)}.",
-            "Give the folder of a recording, or a folder of point clouds.",
+            OF_DEPTH if has_images else "Give the folder of a recording, or a folder of point clouds.",
         )
     return sorted(paths, key=lambda path: natural_key(path.name))

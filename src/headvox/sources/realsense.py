@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from headvox.data import F64, BadFrame, DepthImage, Frame, Intrinsics
-from headvox.errors import HeadvoxError, Undecided
+from headvox.errors import HeadvoxError, MissingExtra, Undecided
 from headvox.machine.latest import Latest
 from headvox.ros.synchronise import Reading, Synchroniser
 from headvox.sources.extrinsics import read_extrinsics
 from headvox.sources.options import ASSUMED, SourceOptions, assumed_mount, mounted
 
 PREFIX = "realsense:"
-INSTALL = "pip install 'headvox[realsense]'"
 FIRST_FRAME_S = 5.0  # a camera takes a second or two to begin
 SILENT_S = 2.0  # after its first frame
 _TOLERANCE_NS = 20_000_000  # images whose stamps differ by no more belong to one frame
@@ -228,7 +227,7 @@ def _pyrealsense2() -> Any:
     try:
         import pyrealsense2
     except ImportError:
-        raise HeadvoxError("RealSense cameras need the package 'pyrealsense2'.", f"Run: {INSTALL}") from None
+        raise MissingExtra("RealSense cameras need the package 'pyrealsense2'.", "realsense") from None
     return pyrealsense2
 
 

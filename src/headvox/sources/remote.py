@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 
 
 def is_remote(place: str | os.PathLike[str]) -> bool:
@@ -35,7 +35,7 @@ def fetched(place: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         import fsspec
     except ImportError:
-        raise HeadvoxError(f"{address}: to read it takes fsspec.", "pip install 'headvox[cluster]'") from None
+        raise MissingExtra(f"{address}: to read it takes fsspec.", "cluster") from None
     with tempfile.TemporaryDirectory(prefix="headvox-") as folder:
         try:
             files, root = fsspec.core.url_to_fs(address)

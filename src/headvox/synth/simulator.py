@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from headvox.data import F64, DepthImage, Frame, Intrinsics
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 from headvox.synth.scene import Scene
 
 NEAR_M, FAR_M = 0.05, 30.0
@@ -80,7 +80,7 @@ def _mujoco() -> Any:
     try:
         return import_module("mujoco")
     except Exception as error:  # it also loads OpenGL, which fails in many ways
-        raise HeadvoxError(f"MuJoCo cannot be used here: {error}", "pip install 'headvox[sim]'") from None
+        raise MissingExtra(f"MuJoCo cannot be used here: {error}", "sim") from None
 
 
 def _common_lens(scene: Scene) -> Intrinsics:

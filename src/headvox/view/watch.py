@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from headvox.data import F64, Frame
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, MissingExtra
 from headvox.sinks import Result
 from headvox.view.mailbox import Mailbox
 
@@ -84,7 +84,7 @@ def check(path: Path | None) -> None:
         HeadvoxError: rerun is not installed, there is no display, or the file cannot be made.
     """
     if importlib.util.find_spec("rerun") is None:
-        raise HeadvoxError("The viewer needs rerun.", "pip install 'headvox[view]'")
+        raise MissingExtra("The viewer needs rerun.", "view")
     if path is not None:
         try:
             path.open("ab").close()

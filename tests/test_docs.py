@@ -272,6 +272,23 @@ def test_the_figures_on_the_first_screen_are_those_of_the_documents() -> None:
     assert not [figure for figure in told if not re.search(rf"(?<![\d.]){re.escape(figure)}", known)]
 
 
+def test_the_shares_of_the_failure_cases_are_those_of_the_document() -> None:
+    lines = (ROOT / "docs" / "accuracy.md").read_text("utf-8").splitlines()
+    found = {}
+    for start in ("| | standing", "| up to 1 m"):
+        (head,) = [n for n, line in enumerate(lines) if line.startswith(start)]
+        names, shares = ([cell.strip() for cell in lines[n].split("|")] for n in (head, head + 2))
+        found.update(zip(names, (share.removesuffix(" %") for share in shares), strict=True))
+    readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
+    for told in (
+        f"found: {found['arms raised']}, {found['bending']} and {found['lying']} % of them; "
+        f"standing: {found['standing']} %",
+        f"found: {found['40-60 %']} % where 40-60 % of the head is seen, {found['80-100 %']} % from 80 % on",
+        f"found: {found['3-4 m']} % at 3-4 m, {found['4-4.8 m']} % beyond",
+    ):
+        assert told in readme
+
+
 def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs" / "pictures").iterdir())
     assert {"sample.gif", "cascade-default.png", "cascade-paper.png"} <= {path.name for path in pictures}

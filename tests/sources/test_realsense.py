@@ -95,6 +95,18 @@ def test_a_recording_of_the_sdk_is_played_whole_by_the_real_pipeline(recorded):
     np.testing.assert_allclose(frames[0].depths[0].T_world_camera, mounted(mount(0, 0, 1.2, 0, 0, 0), True))
 
 
+def test_a_machine_that_is_slow_to_start_loses_no_image(recorded, monkeypatch):
+    class Slow(rs.pipeline):
+        def start(self, config):
+            started = super().start(config)
+            time.sleep(0.5)  # five images long
+            return started
+
+    monkeypatch.setattr(rs, "pipeline", Slow)
+    with closing(open_source(recorded, None, [].append)) as source:
+        assert [int(frame.depths[0].depth[0, 0]) - 1000 for frame in source] == list(range(40))
+
+
 def test_info_tells_what_is_in_a_recording(recorded):
     rows = dict(describe(recorded, SourceOptions(T_world_mount=T)))
     assert (rows["kind"], rows["camera"]) == ("RealSense recording", "123, 64x48")

@@ -52,11 +52,13 @@ class RealSenseFile:
         try:
             config.enable_device_from_file(str(path), repeat_playback=False)
             config.enable_stream(rs.stream.depth)
+            device = config.resolve(rs.pipeline_wrapper(self._pipeline)).get_device()
+            self._playback = device.as_playback()
+            self._playback.set_real_time(
+                False
+            )  # before it starts: in real time, what nobody waits for is lost
             started = self._pipeline.start(config)
             self._open = True
-            device = started.get_device()
-            self._playback = device.as_playback()
-            self._playback.set_real_time(False)
             serial = device.get_info(rs.camera_info.serial_number)
             profile = started.get_stream(rs.stream.depth).as_video_stream_profile()
             scale = _depth_scale(rs, device.query_sensors())
@@ -74,13 +76,15 @@ class RealSenseFile:
         """Yield a frame for each depth image, until the end or until closed."""
         silent_since = time.monotonic()
         while self._open:
+            # Asked before the wait: the last image may still be on its way when the player has stopped.
+            is_over = self._playback.current_status() == self._stopped
             good, frames = self._pipeline.try_wait_for_frames(_POLL_MS)
             if good:
                 silent_since = time.monotonic()
                 depth = frames.get_depth_frame()
                 if depth:
                     yield self._frame(depth)
-            elif self._playback.current_status() == self._stopped:
+            elif is_over:
                 return
             elif time.monotonic() - silent_since > FIRST_FRAME_S:
                 yield BadFrame(0, f"{self.name}: nothing came for {FIRST_FRAME_S:g} s.")

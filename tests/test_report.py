@@ -60,8 +60,12 @@ def test_tracks_are_told_as_they_stand_in_the_table(count):
     for column, name in ((tracks.quaternions, "q"), (tracks.radii, "radius"), (tracks.scores, "score")):
         np.testing.assert_array_equal(column, rows[name])
     np.testing.assert_allclose(tracks.ages_s, np.full(len(rows), 3.05))
+    assert [track.id for track in tracks] == tracks.ids.tolist()
     if count == 40:
         assert set(tracks.states.tolist()) == set(State)
+        assert tracks[-1].centre.tolist() == tracks.centres[len(tracks) - 1].tolist()
+        with pytest.raises(IndexError):
+            tracks[len(tracks)]
 
 
 def test_the_living_that_have_an_id_are_expected():

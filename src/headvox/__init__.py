@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from headvox.config import DetectorConfig as DetectorConfig
+    from headvox.config import TrackerConfig as TrackerConfig
     from headvox.data import BadFrame as BadFrame
     from headvox.data import Cloud as Cloud
     from headvox.data import DepthImage as DepthImage
@@ -26,11 +28,13 @@ _HOME = {
     "Cloud": "headvox.data",
     "DepthImage": "headvox.data",
     "Detector": "headvox.pipeline",
+    "DetectorConfig": "headvox.config",
     "Frame": "headvox.data",
     "Heads": "headvox.data",
     "HeadvoxError": "headvox.errors",
     "Intrinsics": "headvox.data",
     "Tracker": "headvox.tracking.tracker",
+    "TrackerConfig": "headvox.config",
     "open_source": "headvox.sources",
     "sample_folder": "headvox.sample",
 }

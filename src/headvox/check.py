@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from headvox.data import F64, Frame
+from headvox.data import F64, BadFrame, Frame
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
@@ -22,8 +22,15 @@ def knows_an_origin(frame: Frame) -> bool:
     return len(frame.depths) > 0 or any(cloud.T_world_sensor is not None for cloud in frame.clouds)
 
 
-def check_frame(frame: Frame) -> None:
+def check_frame(frame: Frame | BadFrame) -> None:
     """Raise HeadvoxError where a reading has another shape or type than it should, or a place that is not rigid."""
+    if isinstance(frame, BadFrame):
+        raise HeadvoxError(f"There is nothing in a bad frame: {frame.reason}", "Leave it out.")
+    if not float(frame.stamp_ns).is_integer():
+        raise HeadvoxError(
+            f"stamp_ns: expected whole nanoseconds, got {frame.stamp_ns!r}.",
+            "Of seconds, take round(1e9 * seconds).",
+        )
     if not frame.clouds and not frame.depths:
         raise HeadvoxError(
             "The frame has neither points nor depth images.", "Give at least one sensor's reading."

@@ -122,11 +122,11 @@ class Heads:
     def __len__(self) -> int:
         return len(self.scores)
 
+    def __getitem__(self, n: int) -> Head:
+        return Head(self.centres[n], self.quaternions[n], float(self.radii[n]), float(self.scores[n]))
+
     def __iter__(self) -> Iterator[Head]:
-        for centre, quaternion, radius, score in zip(
-            self.centres, self.quaternions, self.radii, self.scores, strict=True
-        ):
-            yield Head(centre, quaternion, float(radius), float(score))
+        return (self[n] for n in range(len(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,20 +203,22 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def __getitem__(self, n: int) -> Track:
+        state = State(self.states[n])
+        return Track(
+            int(self.ids[n]),
+            state,
+            self.centres[n],
+            self.velocities[n] if state != State.TENTATIVE else (math.nan,) * 3,
+            self.quaternions[n],
+            float(self.radii[n]),
+            float(self.scores[n]),
+            sigmas(self.covariances[n, :3, :3]),
+            sigmas(self.rotation_covariances[n]),
+        )
+
     def __iter__(self) -> Iterator[Track]:
-        for n in range(len(self)):
-            state = State(self.states[n])
-            yield Track(
-                int(self.ids[n]),
-                state,
-                self.centres[n],
-                self.velocities[n] if state != State.TENTATIVE else (math.nan,) * 3,
-                self.quaternions[n],
-                float(self.radii[n]),
-                float(self.scores[n]),
-                sigmas(self.covariances[n, :3, :3]),
-                sigmas(self.rotation_covariances[n]),
-            )
+        return (self[n] for n in range(len(self)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,6 +129,21 @@ def test_no_sensor_at_all(make):
         make().detect_depth([])
 
 
+def test_heads_are_rows_of_their_arrays(make):
+    heads = make().detect(two_busts())
+    assert len(heads) >= 2
+    assert [head.score for head in heads] == heads.scores.tolist()
+    assert heads[1].centre.tolist() == heads.centres[1].tolist()
+    assert heads[-1].radius == heads.radii[-1]
+
+
+def test_a_frame_that_is_none(make):
+    with pytest.raises(HeadvoxError, match=r"nothing in a bad frame: damaged\. Leave it out"):
+        make().detect_frame(BadFrame(0, "damaged."))
+    with pytest.raises(HeadvoxError, match=r"expected whole nanoseconds, got 1\.5"):
+        make().detect_frame(Frame(1.5, clouds=(Cloud("c", two_busts()),)))
+
+
 def test_an_unknown_cascade_is_told_when_the_detector_is_made():
     with pytest.raises(HeadvoxError, match="Unknown cascade 'hats'"):
         Detector(DetectorConfig(cascade="hats"))

@@ -93,5 +93,5 @@ def check(path: Path | None) -> None:
     elif sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise HeadvoxError(
             "There is no display to show anything on.",
-            "Write a file with --view NAME.rrd, or use headvox render.",
+            "Write a file: view -o NAME.rrd, or run --view NAME.rrd. Or use headvox render.",
         )

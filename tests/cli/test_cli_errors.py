@@ -24,6 +24,20 @@ def test_a_bad_frame_is_told_counted_and_skipped(tmp_path: Path) -> None:
     assert ["bad", "frames", "1"] in [line.split() for line in headvox("run", folder).stdout.splitlines()]
 
 
+def test_one_reason_of_many_frames_is_told_once(tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "recording", 5, bad=(1,))
+    done = headvox("run", folder, "--centre", 40, 40, 0)
+    assert done.returncode == 1
+    told = [line.partition(": ")[2] for line in done.stderr.splitlines() if not line.startswith(" ")]
+    assert [line.split(":")[0] for line in told] == [
+        "frame 0 skipped",
+        "frame 1 skipped",
+        "frame 2 skipped",
+        "2 more skipped for the same reason",
+        "error",
+    ]
+
+
 def test_strict_stops_at_a_bad_frame(tmp_path: Path) -> None:
     folder = write_recording(tmp_path / "recording", 3, bad=(1,))
     done = headvox("run", folder, "--json", "--strict")

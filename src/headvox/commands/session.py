@@ -60,20 +60,45 @@ class Session:
 
         self.live.show("getting ready (the first time compiles, for half a minute or so)")
         warm_up(self.config)
-        report = run(
-            self.source,
-            self.detector,
-            sinks,
-            tracker=self.tracker,
-            strict=self.strict,
-            limit=self.limit,
-            on_bad=lambda index, reason: self.live.note(f"headvox: frame {index} skipped: {reason}"),
-            on_frame=self.live.frame,
-            on_result=look_at_floor,
-        )
+        with closing(Skipped(self.live.note)) as skipped:
+            report = run(
+                self.source,
+                self.detector,
+                sinks,
+                tracker=self.tracker,
+                strict=self.strict,
+                limit=self.limit,
+                on_bad=skipped.tell,
+                on_frame=self.live.frame,
+                on_result=look_at_floor,
+            )
         if report.heads == 0 and not report.interrupted and not isinstance(self.source, RecordingSource):
             self.live.note("no head in any frame: headvox expects metres, and a world whose z points up")
         return report
+
+
+class Skipped:
+    """Notes on frames that are skipped: those with the reason of the one before are only counted."""
+
+    def __init__(self, note: Callable[[str], None]) -> None:
+        self._note = note
+        self._reason = ""
+        self._more = 0
+
+    def tell(self, index: int, reason: str) -> None:
+        """Take the next frame that is skipped."""
+        if reason == self._reason:
+            self._more += 1
+            return
+        self.close()
+        self._reason = reason
+        self._note(f"headvox: frame {index} skipped: {reason}")
+
+    def close(self) -> None:
+        """Tell of those that were only counted."""
+        if self._more:
+            self._note(f"headvox: {self._more} more skipped for the same reason")
+        self._more = 0
 
 
 @contextmanager

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from headvox.data import Cloud, DepthImage, Intrinsics
+from headvox.frames import placed
 from headvox.fuse import Region
 
 STAGES = """
@@ -136,7 +136,7 @@ def region(radius: float = 0.6, low: float = -0.3, high: float = 0.5, centre=(0.
 
 def turn(rng: np.random.Generator) -> np.ndarray:
     """Return a random rotation (3, 3)."""
-    return Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    return placed(np.zeros(3), rng.normal(size=4))[:3, :3].copy()
 
 
 def pose(rng: np.random.Generator, reach: float = 0.3) -> np.ndarray:

@@ -85,19 +85,20 @@ def linearise(samples, rays, most, modes, k, upright, template, state):
             s = chosen[inside]
             variance = variance + (s[:, 6] * (g * (s[:, 3:6] @ R)).sum(axis=1)) ** 2 + s[:, 7] ** 2
             weight = np.full(len(e), each)
+            turned = np.maximum((g * (s[:, 3:6] @ R)).sum(axis=1) - align.FACING_AWAY, 0.0)
+            hidden = (align.BREADTH_M * turned) ** 2 / (align.CHORD_SIGMA_M**2 + s[:, 6] ** 2)
         else:
+            hidden = np.zeros(len(e))
             weight = np.where(e < 0, align.RAY_WEIGHT, 0.0)
             told[align.CROSSED] = np.sum(e < 0)
-        damp = 1 / (1 + e**2 / variance / k**2)
-        rho = e**2 / variance * damp
-        cost += np.sum(weight * rho)
+        bare = e**2 / variance
+        damp = 1 / (1 + bare / k**2)
+        cost += np.sum(weight * (bare + hidden) / (1 + (bare + hidden) / k**2))
         if kind == "point":
             outside = k * k * np.sum(~inside)
             cost += each * outside
-            told[align.COST], told[align.ON_SURFACE] = (
-                (rho.sum() + outside) / 2,
-                np.sum(e**2 / variance < k**2),
-            )
+            told[align.COST] = ((bare * damp).sum() + outside) / 2
+            told[align.ON_SURFACE] = np.sum(bare < k**2)
         w = np.where(damp < align.LEAST_DAMPING, 0.0, weight * damp**2 / variance)
         A += (J * w[:, None]).T @ J
         b += (J * w[:, None]).T @ e

@@ -137,6 +137,30 @@ def test_normal_equations_equal_the_naive_twin(seed, modes):
     assert not work.A.any()
 
 
+def cost_of_a_point_behind(ray_x, sigma):
+    """Twice what a point on the back of the mean head costs, seen along ``ray_x`` (1: through the face)."""
+    rows = TEMPLATE.rows[..., 0]
+    y, z = (int(-TEMPLATE.low[a] / TEMPLATE.voxel_m) for a in (1, 2))
+    x = int(np.argmax(rows[:, y, z] < 0.0))  # the first voxel inside, from behind
+    place = TEMPLATE.low + (np.array([x, y, z]) + 0.5) * TEMPLATE.voxel_m
+    samples = np.array([[*place, ray_x, 0.0, 0.0, sigma, 0.001]])
+    state, work, told = np.zeros(align.STATE), Scratch.new(), np.zeros(align.TOLD)
+    state[[3, 7, 11]] = 1.0
+    cost = align.linearise(
+        samples, 1, np.zeros((0, 6)), 0, 0, 2.5, False, True, TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m, state,
+        work.J, work.A, told,
+    )  # fmt: skip
+    return 2.0 * cost, told[align.COST]
+
+
+def test_a_point_on_a_surface_that_faces_away_costs_more_the_less_noise_there_is():
+    (seen, bare), (near, near_bare), (far, _) = (
+        cost_of_a_point_behind(ray_x, sigma) for ray_x, sigma in ((1.0, 0.005), (-1.0, 0.005), (-1.0, 0.05))
+    )
+    assert seen < 0.5 < far < near
+    assert bare == near_bare
+
+
 def test_one_start_equals_the_naive_twin(views):
     for view, start in views[:2]:
         samples, rays = gathered(view.frame, start)
@@ -158,7 +182,11 @@ def test_one_start_equals_the_naive_twin(views):
 
 def scattered(rng, count):
     """What a fit may come to: states about one another, what they cost, and covariances."""
-    work = settle.Refined(np.zeros((6, align.STATE)), np.zeros((6, align.TOLD)), np.zeros((6, 6)))
+    work = settle.Refined(
+        np.zeros((trials.MOST_REFINED, align.STATE)),
+        np.zeros((trials.MOST_REFINED, align.TOLD)),
+        np.zeros((6, 6)),
+    )
     for s in range(count):
         work.states[s] = random_state(rng)
         if s and rng.random() < 0.5:  # half a turn away: where rotation vectors jump

@@ -5,8 +5,11 @@ The state is a centre, a rotation, a log scale and the template's modes of shape
     sum over points of rho(e / sigma)  +  rays that cross the template  +  priors,
 
 where e is the distance of a point to the surface, rho(r) = r² / (1 + r² / k²) is Geman and McClure's, and sigma adds up
-the template's own spread and the sensor's noise along and across its ray. What makes a head differ from the template is
-the same for points that are near to each other, so that many points do not say more than INDEPENDENT of them would.
+the template's own spread and the sensor's noise along and across its ray. What makes a head differ from the
+template is the same for points that are near to each other, so that many points do not say more than INDEPENDENT of
+them would. What a state costs, though not where a step goes, knows of one thing more: a point on a surface that faces
+away from its sensor should have been seen a chord before it. Its r² is greater by the square of that chord over its
+sigma.
 """
 
 from __future__ import annotations
@@ -32,6 +35,9 @@ ROOM = 808  # a row of the Jacobian: all points and rays in whole vectors; an od
 # So many points at most count in full: how a head differs from the template, neighbours share.
 INDEPENDENT = 120.0
 RAY_WEIGHT = 8.0
+FACING_AWAY = 0.2  # the cosine from which a surface faces away: the template's normals are only so good
+BREADTH_M = 0.18  # of the ball whose chords these are, and
+CHORD_SIGMA_M = 0.03  # how far those of a head are from its, beside the noise
 CENTRE_SIGMA_M = 0.05
 SCALE_SIGMA = 0.05
 PITCH_SIGMA, ROLL_SIGMA = 0.32, 0.2  # of the angles' sines: a lying head pays a little, not without end
@@ -84,7 +90,7 @@ def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, 
     """Return twice what the first ``n`` points and ``m`` rays cost in ``state``, and how many of them would move it.
 
     ``each`` point has this weight. They have a column in ``J`` each, if it ``steps``. ``told`` receives what the points
-    cost with a weight of 1, how many lie on the surface, and how many rays cross it.
+    cost with a weight of 1 and whatever way they face, how many lie on the surface, and how many rays cross it.
     """
     cx, cy, cz = state[0], state[1], state[2]
     r00, r01, r02 = state[3], state[4], state[5]
@@ -96,7 +102,7 @@ def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, 
     lx, ly, lz = low[0] / voxel_m, low[1] / voxel_m, low[2] / voxel_m
     nx, ny, nz = rows.shape[0], rows.shape[1], rows.shape[2]
     k2 = k * k
-    points_cost = rays_cost = 0.0
+    points_cost = rays_cost = hidden_cost = 0.0
     count = on = crossed = 0
     for s in range(n + m):
         is_point = s < n
@@ -127,13 +133,16 @@ def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, 
             value += state[13 + i] * row[5 + i]
         e = scale * value
         variance = scale * scale * row[4] * row[4]
-        weight = each
+        weight, hidden = each, 0.0
         if is_point:
             toward = gx * (r00 * dx + r10 * dy + r20 * dz)
             toward += gy * (r01 * dx + r11 * dy + r21 * dz)
             toward += gz * (r02 * dx + r12 * dy + r22 * dz)
             noise = points[s, 6] * toward
             variance += noise * noise + points[s, 7] * points[s, 7]
+            if toward > FACING_AWAY:
+                chord = BREADTH_M * (toward - FACING_AWAY)
+                hidden = chord * chord / (CHORD_SIGMA_M * CHORD_SIGMA_M + points[s, 6] * points[s, 6])
         elif e >= 0.0:
             continue
         else:
@@ -141,12 +150,16 @@ def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, 
             crossed += 1
         squared, bound = e * e, k2 * variance
         share = k2 / (bound + squared)
-        damp = share * variance
         if is_point:
-            points_cost += share * squared
+            cost = share * squared
+            points_cost += cost
             on += squared < bound
+            if hidden > 0.0:
+                squared += hidden * variance
+                hidden_cost += k2 / (bound + squared) * squared - cost
         else:
             rays_cost += share * squared
+        damp = share * variance
         if damp < LEAST_DAMPING or not steps:
             continue
         J[0, count], J[1, count], J[2, count] = -gx, -gy, -gz
@@ -159,7 +172,7 @@ def weigh(points, n, each, rays, m, modes, k, steps, rows, low, voxel_m, state, 
         J[RESIDUAL, count], J[WEIGHT, count] = e, weight * damp * share
         count += 1
     told[COST], told[ON_SURFACE], told[CROSSED] = 0.5 * points_cost, on, crossed
-    return each * points_cost + RAY_WEIGHT * rays_cost, count
+    return each * (points_cost + hidden_cost) + RAY_WEIGHT * rays_cost, count
 
 
 @rule

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-FARTHEST_MM, ON_HEAD_MM, NEAREST_M = 600, 200, 0.1
+FARTHEST_MM, LARGEST_MM, ON_HEAD_MM, NEAREST_M = 600, 32_000, 200, 0.1
 
 
 def measured(image, place):
@@ -30,8 +30,12 @@ def of_spot(image, centre, right, up, side, above):
     return known[(len(known) - 1) // 2] if known else None
 
 
+def in_mm(metres):
+    return max(-LARGEST_MM, min(LARGEST_MM, math.floor(1000.0 * metres + 0.5)))
+
+
 def seen_by(image, centre, spots):
-    """What one camera sees of the spots, nearer and farther side, and how much of a head that is."""
+    """What one camera sees of the spots, nearer and farther side, and where it stands; how much of a head that is."""
     ray = centre - image.T_world_camera[:3, 3]
     away = np.linalg.norm(ray)
     if away < NEAREST_M:
@@ -46,24 +50,26 @@ def seen_by(image, centre, spots):
         known = [value for value in both if value is not None]
         on += sum(abs(value) <= ON_HEAD_MM for value in known)
         relief += [min(known), max(known)] if known else [0, 0]
-    return relief, on / away
+    return [*relief, in_mm(away), in_mm(ray[2] / away)], on / away
 
 
-def relief_about(images, centres, spots):
-    """The relief as the camera has it that sees most of a head; zeros where none sees anything of one."""
-    table = np.zeros((len(centres), 2 * len(spots)), np.int16)
+def relief_about(images, centres, radii, spots):
+    """The relief as the camera has it that sees most of a head; zeros where none sees anything of one; and sizes."""
+    table = np.zeros((len(centres), 2 * len(spots) + 4), np.int16)
     for i, centre in enumerate(centres):
         best = 0.0
         for image in images:
             relief, on = seen_by(image, centre, spots)
             if on > best:
-                table[i], best = relief, on
+                table[i, :-2], best = relief, on
+        table[i, -2:] = in_mm(centre[2]), in_mm(radii[i])
     return table
 
 
 def gain(relief_mm, source):
     """What the trees of ``source`` (headvox.masks.cascade.Relief) say of one row, in steps of 1/1024."""
     names = [f"{spot.name}.{side}" for spot in source.spots for side in ("near", "far")]
+    names += ["range", "rise", "height", "radius"]
     metres = {name: value / 1000.0 for name, value in zip(names, relief_mm.tolist(), strict=True)}
 
     def leaf(tree):

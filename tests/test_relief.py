@@ -20,6 +20,7 @@ from headvox.sample import sample_folder
 from headvox.sources import open_source
 
 SPOTS = np.array([(0.03 * side, 0.03 * up) for side in range(5) for up in range(-6, 7)])
+RADIUS = np.array([0.1])
 DEFAULT = (resources.files("headvox") / "cascades" / "default.toml").read_text("utf-8")
 BEFORE = DEFAULT[: DEFAULT.index("[relief]")]
 
@@ -43,13 +44,13 @@ def turned_images(count):
 def test_equals_the_naive_twin(count):
     images = turned_images(count)
     rng = np.random.default_rng(7)
-    before = [
-        (image.T_world_camera @ [*rng.normal(0, 0.3, 2), d, 1])[:3] for image in images for d in (0.6, 1.2)
-    ]
+    depths = (0.6003, 1.2003)  # not halfway between two mm, where the last bit of a pose decides
+    before = [(image.T_world_camera @ [*rng.normal(0, 0.3, 2), d, 1])[:3] for image in images for d in depths]
     there = [image.T_world_camera[:3, 3] + 0.01 for image in images]  # where a camera stands, and all about
     centres = np.array([*before, *there, *rng.uniform(-1.5, 1.5, (12, 3))])
-    relief, best = relief_about(images, centres, SPOTS)
-    np.testing.assert_array_equal(relief, naive_relief.relief_about(images, centres, SPOTS))
+    radii = rng.uniform(0.05, 0.15, len(centres))
+    relief, best = relief_about(images, centres, radii, SPOTS)
+    np.testing.assert_array_equal(relief, naive_relief.relief_about(images, centres, radii, SPOTS))
     assert (best > 0).sum() > 2 * count
     assert (best == 0).any()
     assert len(np.unique(relief)) > 100
@@ -60,8 +61,10 @@ def test_above_and_below_a_camera_equals_the_naive_twin():
     down = np.diag([1.0, -1.0, -1.0, 1.0])
     image = replace(image, T_world_camera=down)
     centres = np.array([[0.0, 0, -1.0], [1e-5, 1e-5, -1.1], [0.0, 0.1, -1.0], [0, 0, 1.0]])
-    relief, best = relief_about((image,), centres, SPOTS)
-    np.testing.assert_array_equal(relief, naive_relief.relief_about((image,), centres, SPOTS))
+    relief, best = relief_about((image,), centres, np.full(4, 0.1), SPOTS)
+    np.testing.assert_array_equal(
+        relief, naive_relief.relief_about((image,), centres, np.full(4, 0.1), SPOTS)
+    )
     assert (best > 0).tolist() == [True, True, True, False]
 
 
@@ -74,14 +77,24 @@ def test_a_sphere_before_a_wall_is_what_geometry_says_from_every_side():
         scenes.looking_along_x(-1.2, 0.0, 0.0),
         np.diag([-1.0, -1, 1, 1]) @ scenes.looking_along_x(-1.2, 0.0, 0.0),
     ):
-        relief, _ = relief_about(
-            (sphere_before_a_wall(T),), np.zeros((1, 3)), np.array([[0.0, 0.0], [0.03, 0.06], [0.2, 0.0]])
-        )
-        near = relief[0, ::2]
+        spots = np.array([[0.0, 0.0], [0.03, 0.06], [0.2, 0.0]])
+        relief, _ = relief_about((sphere_before_a_wall(T),), np.zeros((1, 3)), np.array([0.1]), spots)
+        near, far, measures = relief[0, :6:2], relief[0, 1:6:2], relief[0, 6:]
         assert near[0] == pytest.approx(-100, abs=15)  # the face of it
         assert near[1] == pytest.approx(-1000 * np.sqrt(0.1**2 - 0.03**2 - 0.06**2), abs=20)
         assert near[2] >= 550  # the wall
-        assert np.abs(relief[0, ::2] - relief[0, 1::2]).max() <= 30  # both sides are alike
+        assert np.abs(near - far).max() <= 30  # both sides are alike
+        assert measures.tolist() == [1200, 0, 0, 100]
+
+
+def test_measures_say_where_a_candidate_is():
+    T = scenes.looking_along_x(-1.2, 0.0, 0.0)
+    T[2, 3] = 0.5  # half a metre above the candidate, which is at 1.2 m from where it stands
+    image, centre = sphere_before_a_wall(T), np.array([[0.0, 0.0, 0.0]])
+    seen, _ = relief_about((image,), centre, np.array([0.093]), SPOTS)
+    assert seen[0, -4:].tolist() == [1300, round(-1000 * 0.5 / 1.3), 0, 93]
+    far, _ = relief_about((image,), np.array([[0.0, 0.0, 99.0]]), np.array([np.inf]), SPOTS)
+    assert far[0].tolist() == [0] * (2 * len(SPOTS) + 2) + [32_000, 32_000]  # no camera sees it
 
 
 def test_what_is_not_known_is_neither_free_nor_in_front():
@@ -90,12 +103,13 @@ def test_what_is_not_known_is_neither_free_nor_in_front():
     spots, centre = np.array([[0.2, 0.0], [0.0, 0.0]]), np.zeros((1, 3))
     half = image.depth.copy()
     half[:, : image.intrinsics.width // 2 - 3] = 0
-    whole, _ = relief_about((image,), centre, spots)
-    one, _ = relief_about((replace(image, depth=half),), centre, spots)
+    radii = np.array([0.1])
+    whole, _ = relief_about((image,), centre, radii, spots)
+    one, _ = relief_about((replace(image, depth=half),), centre, radii, spots)
     assert one[0, 0] == one[0, 1]
     assert one[0, 0] in whole[0, :2]
     half[:, image.intrinsics.width // 2 + 3 :] = 0
-    none, _ = relief_about((replace(image, depth=half),), centre, spots)
+    none, _ = relief_about((replace(image, depth=half),), centre, radii, spots)
     assert none[0, :2].tolist() == [0, 0]
     assert none[0, 2] == whole[0, 2]
 
@@ -109,8 +123,9 @@ def test_the_trees_of_the_default_add_up_as_the_naive_twin_says():
         [(image.T_world_camera @ [*rng.normal(0, 0.2, 2), 1.0, 1])[:3] for image in images for _ in range(20)]
     )
     relief = compiled(source)
-    gains = gains_of(images, centres, relief)
-    seen, best = relief_about(images, centres, relief.spots)
+    radii = rng.uniform(0.05, 0.15, len(centres))
+    gains = gains_of(images, centres, radii, relief)
+    seen, best = relief_about(images, centres, radii, relief.spots)
     wanted = [naive_relief.gain(row, source) if there else 0 for row, there in zip(seen, best, strict=True)]
     assert gains.tolist() == wanted
     assert len(set(wanted)) > 10
@@ -120,9 +135,9 @@ def test_the_trees_of_the_default_add_up_as_the_naive_twin_says():
 def test_the_score_changes_by_no_more_than_the_cascade_allows(leaf, gained):
     image = sphere_before_a_wall(scenes.looking_along_x(-1.2, 0.0, 0.0))
     relief = compiled(Relief(1.0, (Spot("s", 0.0, 0.0),), (leaf,)))
-    assert gains_of((image,), np.zeros((1, 3)), relief).tolist() == [1024 * gained]
-    assert gains_of((image,), np.full((1, 3), 9.0), relief).tolist() == [0]  # out of view
-    assert gains_of((), np.zeros((1, 3)), relief).tolist() == [0]
+    assert gains_of((image,), np.zeros((1, 3)), RADIUS, relief).tolist() == [1024 * gained]
+    assert gains_of((image,), np.full((1, 3), 9.0), RADIUS, relief).tolist() == [0]  # out of view
+    assert gains_of((), np.zeros((1, 3)), RADIUS, relief).tolist() == [0]
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +178,7 @@ def test_where_a_head_is_expected_less_is_enough(tmp_path, sample):
     steps = np.rint(heads.scores * 1024).astype(int)
     expected = Expected(heads.centres[-1:], np.full((1, 4), np.nan), np.array([0.05]))
     common = (sample.depths, relief, int(steps[-1]) + 100)
-    peaks = (heads.centres, steps)
+    peaks = (heads.centres, heads.radii, steps)
     which, scores = look_again(*peaks, *common, 200, expected, 0.05)
     assert which.tolist() == [*np.flatnonzero(steps >= steps[-1] + 100), len(heads) - 1]
     assert scores.tolist() == steps[which].tolist()

@@ -364,7 +364,7 @@ class Detector:
         scores, relief = scores[kept], self.cascade.relief
         limits = (least, slack_of(self.config, expected), expected, memory.lattice.voxel_m)
         if relief is not None and asks_cameras(frame, memory.sees):
-            again, scores = look_again(centres, scores, frame.depths, relief, *limits)
+            again, scores = look_again(centres, radii, scores, frame.depths, relief, *limits)
             kept, centres, radii = kept[again], centres[again], radii[again]
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks[kept]]]

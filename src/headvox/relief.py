@@ -2,8 +2,8 @@
 
 Voxels are 5 cm wide, and their rings know nothing of where the camera stands. Here *spots* lie on a plane that faces
 the camera, so far to the right and to the left of the centre and so far above it; of each the relief says how much
-farther than the centre the surface is. Small trees over these numbers change the score a little: by no more than the
-cascade allows.
+farther than the centre the surface is. Small trees over these numbers, and over where the candidate is and how large
+(:data:`headvox.masks.cascade.MEASURES`), change the score a little: by no more than the cascade allows.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from headvox.data import F64, DepthImage, Expected
 from headvox.keep import keep
 from headvox.machine.kernels import bare_kernel, kernel, read_only
 from headvox.machine.simd import LANES
+from headvox.masks.cascade import MEASURES, SIDES
 from headvox.masks.compile import CompiledRelief
 from headvox.visibility import NEAREST_M, read_pixels, world_to_pixels
 from headvox.vote import order
@@ -28,6 +29,7 @@ FARTHEST = 600  # mm: farther from the centre, either way, is as far
 UNKNOWN = 601  # no return, or out of view
 NINE, STEP_M = 9, 0.01  # 3x3 places, as far from each other, whose median is a spot's
 ON_HEAD = 200  # mm: surface that may be the head's or the neck's
+LARGEST = 32_000  # mm: what a measure is at most, either way
 STEEP = 1e-3  # sine of the angle between a ray and the vertical, from which on nothing is right or left
 
 
@@ -89,12 +91,26 @@ def take_medians(beyond, medians):
         medians[lane] = beyond[max(known - 1, 0) // 2 * lanes + lane]
 
 
+@bare_kernel
+def in_mm(metres):
+    """Return ``metres`` in millimetres, as far as a measure goes."""
+    return np.int16(min(max(np.floor(1000.0 * metres + 0.5), -LARGEST), LARGEST))
+
+
+@kernel
+def set_sizes(centres, radii, relief):
+    """Write the last two measures to ``relief`` (N, 2 K + 4), mm: how high a candidate is, and the sphere's radius."""
+    for i in range(centres.shape[0]):
+        relief[i, -2], relief[i, -1] = in_mm(centres[i, 2]), in_mm(radii[i])
+
+
 @kernel
 def look_closely(depth, scale, camera, origin, centres, spots, best, relief):
-    """Write what one camera measured about each of ``centres`` (N, 3), world, to ``relief`` (N, 2 K), mm.
+    """Write what one camera measured about each of ``centres`` (N, 3), world, to ``relief`` (N, 2 K + 4), mm.
 
-    It does so where the camera sees more of a head than any before it: ``best`` (N,) says how much that was. ``camera``
-    is (3, 4): rows that give u·Z, v·Z and Z of a world point; ``origin`` (3,) is where it stands.
+    Of the measures it writes the first two. It does so where the camera sees more of a head than any before it:
+    ``best`` (N,) says how much that was. ``camera`` is (3, 4): rows that give u·Z, v·Z and Z of a world point;
+    ``origin`` (3,) is where it stands.
     """
     count = spots.shape[0]
     lanes = -(-2 * count // LANES) * LANES
@@ -138,28 +154,37 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):
             # What is not known on either side is neither free space nor in front.
             one, other = one if one != UNKNOWN else 0, other if other != UNKNOWN else 0
             relief[i, 2 * k], relief[i, 2 * k + 1] = min(one, other), max(one, other)
+        relief[i, 2 * count], relief[i, 2 * count + 1] = in_mm(away), in_mm(dz / away)
 
 
 @kernel
-def add_trees(relief, best, nodes, roots, depths, most, gains):
-    """Write what the trees say of each row of ``relief`` (N, 2 K) to ``gains`` (N,), at most ``most`` either way.
+def add_trees(relief, best, nodes, roots, deepest, most, gains):
+    """Write what the trees say of each row of ``relief`` (N, 2 K + 4) to ``gains`` (N,), at most ``most`` either way.
 
     Of what no camera saw (``best`` (N,) is 0) they say nothing.
     """
+    at = np.empty_like(roots)
     for i in range(relief.shape[0]):
         total = np.int64(0)
         if best[i] > 0.0:
+            at[:] = roots
+            for _ in range(deepest):  # all trees, a step at a time: no step has to wait for the one before
+                for t in range(np.uint64(roots.shape[0])):
+                    node = at[t]
+                    at[t] = nodes[node + 2 + (relief[i, nodes[node]] > nodes[node + 1])]
             for t in range(roots.shape[0]):
-                at = roots[t]
-                for _ in range(depths[t]):
-                    at = nodes[at + 2 + (relief[i, nodes[at]] > nodes[at + 1])]
-                total += nodes[at + 1]
+                total += nodes[at[t] + 1]
         gains[i] = min(max(total, -most), most)
 
 
-def relief_about(images: Sequence[DepthImage], centres: F64, spots: F64) -> tuple[I16, F64]:
-    """Return the relief (N, 2 K) about ``centres`` (N, 3), mm, and how well a camera saw each (N,); 0: none did."""
-    best, relief = np.zeros(len(centres)), np.zeros((len(centres), 2 * len(spots)), np.int16)
+def relief_about(images: Sequence[DepthImage], centres: F64, radii: F64, spots: F64) -> tuple[I16, F64]:
+    """Return the relief (N, 2 K + 4), mm, of candidates, and how well a camera saw each (N,); 0: none did.
+
+    ``centres`` (N, 3), world, and ``radii`` (N,) are theirs, ``spots`` (K, 2) the places to look at, all metres.
+    """
+    best, features = np.zeros(len(centres)), len(SIDES) * len(spots) + len(MEASURES)
+    relief = np.zeros((len(centres), features), np.int16)
+    set_sizes(centres, radii, relief)
     for image in images:
         camera, origin = world_to_pixels(image)
         scale = image.intrinsics.depth_scale
@@ -167,24 +192,29 @@ def relief_about(images: Sequence[DepthImage], centres: F64, spots: F64) -> tupl
     return relief, best
 
 
-def gains_of(images: Sequence[DepthImage], centres: F64, relief: CompiledRelief) -> I64:
-    """Return by how much the scores of what is at ``centres`` (N, 3), world, change, in steps: 0 where none sees it."""
-    seen, best = relief_about(images, np.ascontiguousarray(centres), relief.spots)
+def gains_of(images: Sequence[DepthImage], centres: F64, radii: F64, relief: CompiledRelief) -> I64:
+    """Return by how much the scores of candidates change, in steps: 0 where no camera sees them.
+
+    ``centres`` (N, 3), world, and ``radii`` (N,) are in metres.
+    """
+    seen, best = relief_about(
+        images, np.ascontiguousarray(centres), np.ascontiguousarray(radii), relief.spots
+    )
     gains = np.zeros(len(centres), np.int64)
-    add_trees(seen, best, relief.nodes, relief.root, relief.depth, relief.most, gains)
+    add_trees(seen, best, relief.nodes, relief.root, relief.deepest, relief.most, gains)
     return gains
 
 
 def look_again(
-    centres: F64, scores: I64, images: Sequence[DepthImage], relief: CompiledRelief, least: int, slack: int,
-    expected: Expected | None, voxel_m: float,
+    centres: F64, radii: F64, scores: I64, images: Sequence[DepthImage], relief: CompiledRelief, least: int,
+    slack: int, expected: Expected | None, voxel_m: float,
 ) -> tuple[I64, I64]:  # fmt: skip
-    """Return which of the peaks at ``centres`` (N, 3), world, are heads after the last look, best first, and what they
-    score then.
+    """Return which peaks are heads after the last look, best first, and what they score then.
 
-    For the numbers in steps see :func:`headvox.keep.keep`.
+    ``centres`` (N, 3), world, and ``radii`` (N,) are of the spheres that fit them, in metres. For the numbers in steps
+    see :func:`headvox.keep.keep`.
     """
-    scores = scores + gains_of(images, centres, relief)
+    scores = scores + gains_of(images, centres, radii, relief)
     kept = np.flatnonzero(keep(centres, scores, least, slack, expected, voxel_m))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     return kept, scores[kept]

@@ -80,7 +80,7 @@ class OnDevice:
         common = (asked.slack, asked.expected, asked.lattice.voxel_m)
         if relief is not None and asked.sees:
             least += relief.most
-            kept, scores = look_again(centres, scores, asked.frame.depths, relief, least, *common)
+            kept, scores = look_again(centres, radii, scores, asked.frame.depths, relief, least, *common)
             centres, radii, yaws = centres[kept], radii[kept], None if yaws is None else yaws[kept]
             poses = None if poses is None else poses.of(kept, centres)
         heads = stated(centres, radii, scores, least, yaws)

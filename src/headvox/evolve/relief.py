@@ -1,6 +1,6 @@
 """The trees of the last look: fitted to the peaks that the detector leaves in spoilt views, as the judge's last stage.
 
-What is asked is new to the cascade, at the full resolution of the images, so a few leaves a tree are no luxury here;
+What is asked is new to the cascade, at the full resolution of the images, so many leaves a tree are no luxury here;
 how far all of them together may change a score is limited instead.
 """
 
@@ -22,15 +22,16 @@ from headvox.evolve.boost import train
 from headvox.evolve.check import heads_in
 from headvox.evolve.spoil import spoil
 from headvox.evolve.views import View
-from headvox.masks.cascade import SIDES, Relief, Spot, Tree
+from headvox.masks.cascade import MEASURES, SIDES, Relief, Spot, Tree, cuts
 from headvox.relief import relief_about
 
 LEAST_SCORE = -5.0  # of the peaks that are looked at
-MOST_SPOTS = 48  # chosen by what a short boosting over all gains from them
+MOST_SPOTS = 72  # chosen by what a short boosting over all gains from them
 CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE = 100, 0.15, 0.2
-TREES, RATE, SHARE_OF_FEATURES = 300, 0.1, 0.35
-LEAVES, LEAST_ROWS = 4, 80
-MOST = 2.0  # how far the score may change
+TREES, RATE, SHARE_OF_FEATURES = 300, 0.1, 0.3
+LEAVES, LEAST_ROWS = 16, 60
+TURNS = 3  # how often each view is taken
+MOST = 3.0  # how far the score may change
 
 FINE_CM = [(side, up) for side in range(0, 16, 3) for up in range(-15, 16, 3)]
 COARSE_CM = [(side, up) for side in range(0, 37, 6) for up in range(-60, 31, 6)]
@@ -43,7 +44,7 @@ PLACES: F64 = np.array([(spot.side, spot.up) for spot in SPOTS])
 
 @dataclass(frozen=True)
 class Looks:
-    """What was seen about some peaks: ``relief`` (N, 2 SPOTS) mm, whether it is a head, and the score before."""
+    """What was seen about some peaks: ``relief`` (N, 2 SPOTS + 4) mm, whether it is a head, and the score before."""
 
     relief: npt.NDArray[np.int16]
     label: npt.NDArray[np.int8]
@@ -57,10 +58,12 @@ class Looks:
 
 
 def spoilt_looks(view: View, cascade: Path) -> Looks | None:
-    """Return what is seen about the peaks of ``view``, spoilt, or None: there are none, or it is kept aside."""
+    """Return what is seen about the peaks of ``view``, spoilt :data:`TURNS` times; None: of none, or kept aside."""
     if not view.frame.depths or view.frame.clouds or samples.is_aside(np.array([view.number]))[0]:
         return None
-    return looks_at(spoil(view, np.random.default_rng([view.number, 7])), cascade)
+    turned = (spoil(view, np.random.default_rng([view.number, 7, k])) for k in range(TURNS))
+    some = [looks for looks in (looks_at(one, cascade) for one in turned) if looks is not None]
+    return Looks.join(some) if some else None
 
 
 def looks_at(view: View, cascade: Path) -> Looks | None:
@@ -72,7 +75,7 @@ def looks_at(view: View, cascade: Path) -> Looks | None:
     known = np.flatnonzero(label >= 0)
     if not len(known):
         return None
-    relief, _ = relief_about(view.frame.depths, heads.centres[known], PLACES)
+    relief, _ = relief_about(view.frame.depths, heads.centres[known], heads.radii[known], PLACES)
     return Looks(relief, label[known], heads.scores[known])
 
 
@@ -86,27 +89,28 @@ def fit_relief(looks: Looks, seed: int) -> Relief | None:
         features = looks.relief[:, columns].astype(np.float32)
         return train(features, looks.label, looks.score, None, trees, rate, share, seed, settings)
 
-    every = np.arange(looks.relief.shape[1])
+    sides = len(SIDES) * len(SPOTS)
+    every = np.arange(sides + len(MEASURES))
     gain = fit(every, CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE).feature_importance("gain")
-    of_spot = gain.reshape(-1, len(SIDES)).sum(axis=1)
+    of_spot = gain[:sides].reshape(-1, len(SIDES)).sum(axis=1)
     chosen = np.sort(np.argsort(-of_spot, kind="stable")[:MOST_SPOTS])
-    columns = every[np.isin(every // len(SIDES), chosen)]
+    columns = every[np.isin(every // len(SIDES), chosen) | (every >= sides)]
     model = fit(columns, TREES, RATE, SHARE_OF_FEATURES)
     trees = tuple(_tree(info["tree_structure"], columns) for info in model.dump_model()["tree_info"])
-    used = {name for tree in trees for name in _names(tree)}
+    used = {name.rpartition(".")[0] for tree in trees for name, _ in cuts(tree)} - {""}
     return Relief(MOST, tuple(spot for spot in SPOTS if spot.name in used), trees) if used else None
 
 
 def _tree(node: dict[str, Any], columns: npt.NDArray[np.int64]) -> Tree:
     if "leaf_value" in node:
         return round(float(node["leaf_value"]), 3) + 0.0
-    spot, side = divmod(int(columns[node["split_feature"]]), len(SIDES))
     metres = (math.floor(node["threshold"]) + 0.5) / 1000.0
     below, above = (_tree(node[child], columns) for child in ("left_child", "right_child"))
-    return f"{SPOTS[spot].name}.{SIDES[side]}", metres, below, above
+    return _name(int(columns[node["split_feature"]])), metres, below, above
 
 
-def _names(tree: Tree) -> set[str]:
-    if not isinstance(tree, tuple):
-        return set()
-    return {tree[0].rpartition(".")[0]} | _names(tree[2]) | _names(tree[3])
+def _name(column: int) -> str:
+    spot, side = divmod(column, len(SIDES))
+    if spot < len(SPOTS):
+        return f"{SPOTS[spot].name}.{SIDES[side]}"
+    return MEASURES[column - len(SIDES) * len(SPOTS)]

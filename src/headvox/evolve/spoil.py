@@ -13,7 +13,7 @@ from headvox.data import DepthImage
 from headvox.evolve.views import View
 from headvox.frames import transform
 
-MOVED_M = (0.05, 0.05, 0.03)
+MOVED_M = (0.05, 0.05, 0.15)  # upwards by more: poses are seldom right about the floor
 SPOILT_SHARE = 0.7  # of the views; the others are turned and moved only
 EDGE_M = 0.10  # between neighbouring pixels: the edge of something
 FAR_M = 9.0  # what no reading counts as, beside an edge

@@ -18,6 +18,9 @@ CHANNELS = ("occupied", "empty", "hidden")
 # smallest, 3rd smallest, 3rd largest, largest, all together
 STATISTICS = ("min", "low", "high", "max", "sum")
 SIDES = ("near", "far")  # of a spot: that where the surface is nearer to the camera, and the other
+MEASURES = ("range", "rise", "height", "radius")
+"""Of a candidate: how far its camera is (m), how much higher than that it is for each metre of these, how high above
+z = 0 (m), and the radius of the sphere that fits it (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +99,8 @@ class Spot:
 class Relief:
     """The last look at what may be a head, pixel by pixel: trees change the score, by ``most`` at most.
 
-    A cut is in metres: how much farther than the candidate the surface is at a spot, on its nearer or farther side.
+    A cut is in metres: how much farther than the candidate the surface is at a spot, on its nearer or farther side; or
+    it is of one of :data:`MEASURES`.
     """
 
     most: float

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from headvox.errors import HeadvoxError
 from headvox.masks.cascade import (
     CHANNELS,
+    MEASURES,
     SIDES,
     STATISTICS,
     Box,
@@ -33,6 +34,7 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
 SCORE_UNIT = 1024
+FARTHEST_M = 1000.0  # cuts of the last look: nothing that it asks reaches as far, and millimetres fit 32 bits
 MAX_SEEN_CELLS = 1 << 20
 
 
@@ -112,16 +114,17 @@ class CompiledStages:
 
 @dataclass(frozen=True, slots=True)
 class CompiledRelief:
-    """The last look in millimetres. Feature 2 k is the near, 2 k + 1 the far side of spot k.
+    """The last look in millimetres. Feature 2 k is the near, 2 k + 1 the far side of spot k; then come the measures.
 
-    ``nodes``, ``root`` and ``depth`` are as those of :class:`CompiledStages`.
+    ``nodes`` and ``root`` are as those of :class:`CompiledStages`.
     """
 
     spots: npt.NDArray[np.float64]
     """(K, 2) metres to the side and up"""
-    nodes: I64
+    nodes: I32
     root: I64
-    depth: I32
+    deepest: int
+    """How many steps the deepest tree takes; a leaf leads to itself."""
     most: int
     """The score changes by no more than that, in steps."""
 
@@ -314,16 +317,19 @@ def _compile_relief(relief: Relief) -> CompiledRelief:
     index = {spot.name: k for k, spot in enumerate(relief.spots)}
 
     def asked(name: str, metres: float) -> tuple[int, int]:
+        cut = _floor(round(1000.0 * min(max(metres, -FARTHEST_M), FARTHEST_M), 6))
+        if name in MEASURES:
+            return len(SIDES) * len(index) + MEASURES.index(name), cut
         spot, _, side = name.rpartition(".")
-        return len(SIDES) * index[spot] + SIDES.index(side), _floor(round(1000.0 * metres, 6))
+        return len(SIDES) * index[spot] + SIDES.index(side), cut
 
     nodes: list[int] = []
     roots = [_add_tree(tree, asked, nodes) for tree in relief.trees]
     return CompiledRelief(
         np.array([(spot.side, spot.up) for spot in relief.spots]),
-        np.array(nodes, dtype=np.int64),
+        np.array(nodes, dtype=np.int32),
         np.array([root for root, _ in roots], dtype=np.int64),
-        np.array([depth for _, depth in roots], dtype=np.int32),
+        max((depth for _, depth in roots), default=0),
         math.floor(relief.most * SCORE_UNIT),
     )
 

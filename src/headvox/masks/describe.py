@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 
 from headvox.commands.table import printable, table
-from headvox.masks.cascade import Cascade, Condition, Group, Relief, Stage, Verification, Votes, cuts
+from headvox.masks.cascade import (
+    MEASURES,
+    Cascade,
+    Condition,
+    Group,
+    Relief,
+    Stage,
+    Verification,
+    Votes,
+    cuts,
+)
 from headvox.masks.compile import volume, voxel_box
 
 LOOK_UPS_A_BOX = 8
@@ -169,18 +180,18 @@ def _stages(cascade: Cascade) -> str:
 
 
 def _relief(relief: Relief) -> str:
-    asked = {name.rpartition(".")[0]: 0 for tree in relief.trees for name, _ in cuts(tree)}
-    for tree in relief.trees:
-        for name, _ in cuts(tree):
-            asked[name.rpartition(".")[0]] += 1
-    rows = [
-        [spot.name, f"{spot.side:g}", f"{spot.up:+g}", str(asked.get(spot.name, 0))] for spot in relief.spots
-    ]
+    asked = Counter(
+        name if name in MEASURES else name.rpartition(".")[0]
+        for tree in relief.trees
+        for name, _ in cuts(tree)
+    )
+    rows = [[spot.name, f"{spot.side:g}", f"{spot.up:+g}", str(asked[spot.name])] for spot in relief.spots]
+    measures = [[name, "", "", str(asked[name])] for name in MEASURES if asked[name]]
     heading = (
         f"The last look, in depth images: {len(relief.trees)} trees over {len(rows)} pairs of spots, which change the "
         f"score by {relief.most:g} at most"
     )
-    return f"{heading}\n{table(['spot', 'to either side (m)', 'up (m)', 'cuts'], rows)}"
+    return f"{heading}\n{table(['spot', 'to either side (m)', 'up (m)', 'cuts'], rows + measures)}"
 
 
 def _verification(rule: Verification) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 from headvox.errors import HeadvoxError
 from headvox.masks.cascade import (
     CHANNELS,
+    MEASURES,
     SIDES,
     Box,
     Cascade,
@@ -225,7 +226,9 @@ class _Reader:
             raise self.error(where, "[feature, cut, at most, above], 30 deep at most", value)
         feature = self.text(value[0], where)
         if feature not in features:
-            raise self.error(where, "a statistic of a group or a side of a spot of this file", feature)
+            raise self.error(
+                where, "a statistic of a group, a side of a spot of this file, or a measure", feature
+            )
         cut = self.number(value[1], where)
         return (
             feature,
@@ -261,7 +264,7 @@ class _Reader:
             spots.append(Spot(name, side, up))
         if not 1 <= len(spots) <= MOST_SPOTS:
             raise self.error("relief.spots", f"a table of 1 to {MOST_SPOTS} spots", named)
-        features = {f"{spot.name}.{side}" for spot in spots for side in SIDES}
+        features = {f"{spot.name}.{side}" for spot in spots for side in SIDES} | set(MEASURES)
         trees = self.items(table.get("trees"), "relief.trees")
         most = self.number(table.get("most"), "relief.most", 0.0, 1000.0)
         return Relief(most, tuple(spots), tuple(self.tree(tree, features, "relief.trees") for tree in trees))

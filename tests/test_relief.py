@@ -219,4 +219,4 @@ def test_a_relief_that_is_none_is_told_in_one_line(relief, said):
 
 def test_the_last_look_is_described():
     told = describe_cascade(load_cascade("default"))
-    assert "The last look, in depth images: 300 trees over 48 pairs of spots" in told
+    assert "The last look, in depth images: 300 trees over 72 pairs of spots" in told

@@ -31,7 +31,7 @@ CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE = 100, 0.15, 0.2
 TREES, RATE, SHARE_OF_FEATURES = 300, 0.1, 0.3
 LEAVES, LEAST_ROWS = 16, 60
 TURNS = 3  # how often each view is taken
-MOST = 3.0  # how far the score may change
+MOST = 2.0  # how far the score may change
 
 FINE_CM = [(side, up) for side in range(0, 16, 3) for up in range(-15, 16, 3)]
 COARSE_CM = [(side, up) for side in range(0, 37, 6) for up in range(-60, 31, 6)]
@@ -58,8 +58,11 @@ class Looks:
 
 
 def spoilt_looks(view: View, cascade: Path) -> Looks | None:
-    """Return what is seen about the peaks of ``view``, spoilt :data:`TURNS` times; None: of none, or kept aside."""
-    if not view.frame.depths or view.frame.clouds or samples.is_aside(np.array([view.number]))[0]:
+    """Return what is seen about the peaks of ``view``, spoilt :data:`TURNS` times; None: of none, or for others."""
+    number = np.array([view.number])
+    if samples.is_aside(number)[0] or samples.is_for_verification(number)[0]:
+        return None
+    if not view.frame.depths or view.frame.clouds:
         return None
     turned = (spoil(view, np.random.default_rng([view.number, 7, k])) for k in range(TURNS))
     some = [looks for looks in (looks_at(one, cascade) for one in turned) if looks is not None]

@@ -1,7 +1,8 @@
 """What the pose fit may take from a score: fitted to the heads that the detector tells in spoilt views, and the others.
 
 Three numbers by logistic regression, beside a score that stays as it is: what misfit and radius say is much the same
-for every sensor and range, and trees over more of what the fit tells found no more on views kept aside.
+for every sensor and range, and trees over more of what the fit tells found no more on views kept aside. They are fitted
+on views of their own: where the last look has learnt, its scores know the answer, and the fit seems to add little.
 """
 
 from __future__ import annotations
@@ -47,8 +48,10 @@ class Fits:
 
 
 def spoilt_fits(view: View, cascade: Path) -> Fits | None:
-    """Return what is fitted in ``view``, spoilt, or None: there is nothing, no camera, or it is kept aside."""
-    if not view.frame.depths or view.frame.clouds or samples.is_aside(np.array([view.number]))[0]:
+    """Return what is fitted in ``view``, spoilt, or None: there is nothing, no camera, or it is for others."""
+    if not samples.is_for_verification(np.array([view.number]))[0]:
+        return None
+    if not view.frame.depths or view.frame.clouds:
         return None
     return fits_in(spoil(view, np.random.default_rng([view.number, 11])), cascade)
 

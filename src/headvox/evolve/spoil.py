@@ -1,4 +1,4 @@
-"""Views as a worse sensor somewhere else would have seen them: turned, moved against the grid, with readings lost."""
+"""Views as a worse sensor somewhere else would have seen them: turned, tilted, moved, with readings lost."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from headvox.data import DepthImage
 from headvox.evolve.views import View
 from headvox.frames import transform
 
-MOVED_M = (0.05, 0.05, 0.15)  # upwards by more: poses are seldom right about the floor
+MOVED_M = (0.05, 0.05, 0.2)  # upwards by more: poses are seldom right about the floor,
+TILTED_RAD = 0.05  # nor about the vertical: standard deviation, about either level axis
 SPOILT_SHARE = 0.7  # of the views; the others are turned and moved only
 EDGE_M = 0.10  # between neighbouring pixels: the edge of something
 FAR_M = 9.0  # what no reading counts as, beside an edge
@@ -23,10 +24,12 @@ Mask = npt.NDArray[np.bool_]
 
 
 def spoil(view: View, rng: Rng) -> View:
-    """Return ``view`` turned about the vertical and moved a little, most of its images with readings lost."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", rng.uniform(0.0, 2.0 * np.pi)).as_matrix()
-    T[:3, 3] = rng.uniform(-1.0, 1.0, 3) * MOVED_M
+    """Return ``view`` turned about the vertical, tilted and moved a little, most of its images with readings lost."""
+    turned, tilted = rng.uniform(0.0, 2.0 * np.pi), rng.normal(0.0, TILTED_RAD, 2)
+    eye, T = view.frame.depths[0].T_world_camera[:3, 3], np.eye(4)  # tilted about where it stands
+    T[:3, :3] = (Rotation.from_euler("z", turned) * Rotation.from_rotvec([*tilted, 0.0])).as_matrix()
+    T[:3, 3] = Rotation.from_euler("z", turned).apply(eye) - T[:3, :3] @ eye
+    T[:3, 3] += rng.uniform(-1.0, 1.0, 3) * MOVED_M
     images = tuple(replace(image, T_world_camera=T @ image.T_world_camera) for image in view.frame.depths)
     if rng.random() < SPOILT_SHARE:
         images = tuple(_lose_readings(image, rng) for image in images)

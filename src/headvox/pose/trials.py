@@ -24,7 +24,7 @@ COARSE_MODES = 0
 # Of the first coarse step (1 less each step), the first and the last fine one.
 COARSE_K, FINE_K, LAST_K = 4.0, 4.0, 2.5
 MOST_STARTS = 60
-MOST_REFINED = 7
+MOST_REFINED = 6
 MARGIN = 7.0  # a start that costs more than the best one by this is not refined, but for the second best
 ALIKE = 2.91  # trace of the turn between two starts that are one: 17 degrees apart
 LEAST_SAMPLES = 20  # fewer points say nothing about a pose

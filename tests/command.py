@@ -8,6 +8,7 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 from headvox.cli import main
 
@@ -37,7 +38,7 @@ def parse(line: str) -> dict[str, object]:
     return parsed
 
 
-def heads_of(output: str) -> list[object]:
+def heads_of(output: str) -> list[Any]:
     return [parse(line)["heads"] for line in output.splitlines()]
 
 

@@ -104,7 +104,7 @@ def test_the_same_of_heads_that_overlap(count):
     assert count < 12 or len(wanted) < count
 
 
-@pytest.mark.skipif(not is_simulated(), reason="calls a device function")
+@pytest.mark.skipif(not is_simulated(), reason="only the simulator lets the host call a device function")
 @pytest.mark.parametrize("room", [2, 3, 7, 8])
 def test_a_full_list_is_thinned_as_on_the_cpu(room):
     for there in (0, 1, room - 1, room, room + 1, 3 * room, 41, 64):
@@ -179,7 +179,7 @@ def scenes_to_gather():
 def test_the_same_is_gathered(kind, few):
     """Also where there is not room for all."""
     if few and not is_simulated():
-        pytest.skip("the number is compiled in")
+        pytest.skip("on a GPU the room is compiled in: only the simulator can have less")
     room = 30 if few else nearby.MOST_SAMPLES
     frame = scenes_to_gather()[kind]
     centre = np.array([1.1, -0.2, 0.05]) if kind != "images" else np.zeros(3)

@@ -210,7 +210,7 @@ def test_the_bench_measures_everything(cascades, capsys):
         assert row in told or (row == "one by one" and result["one_graph"])
 
 
-@pytest.mark.skipif(not is_simulated(), reason="there is a GPU")
+@pytest.mark.skipif(not is_simulated(), reason="on a GPU the bench runs: it is the simulator that is refused")
 def test_the_bench_refuses_the_simulator(capsys):
     assert main(["bench", "--backend", "cuda"]) == 1
     said = capsys.readouterr()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -40,8 +41,16 @@ def write_recording(folder: Path, frames: int, bad: tuple[int, ...] = ()) -> Pat
     for name in ("good", "bad"):
         Image.fromarray(depth).save(folder / "cam" / f"{name}.png")
     (folder / "cam" / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n and then nothing")
-    camera = {"width": 80, "height": 60, "fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5, "depth_scale": 0.001}
-    camera["T_world_camera"] = [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]  # type: ignore[assignment]
+    camera: dict[str, Any] = {
+        "width": 80,
+        "height": 60,
+        "fx": 70.0,
+        "fy": 70.0,
+        "cx": 39.5,
+        "cy": 29.5,
+        "depth_scale": 0.001,
+    }
+    camera["T_world_camera"] = [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
     lines = [
         {"stamp_ns": 100_000_000 * k, "depth": {"cam": f"cam/{'bad' if k in bad else 'good'}.png"}}
         for k in range(frames)

@@ -58,7 +58,7 @@ def test_a_closed_pipe_ends_quietly(recording: Path) -> None:
     os.close(writing)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full exists on Linux only")
 def test_a_full_disk_is_explained(recording: Path) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(

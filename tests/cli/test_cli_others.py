@@ -62,7 +62,7 @@ def test_warmup_leaves_nothing_to_compile() -> None:
 def test_bench_gets_its_own_flags(monkeypatch: pytest.MonkeyPatch) -> None:
     got: list[list[str]] = []
     bench = types.ModuleType("headvox.bench.command")
-    bench.main = lambda argv: got.append(argv) or 3  # type: ignore[attr-defined]
+    monkeypatch.setattr(bench, "main", lambda argv: got.append(argv) or 3, raising=False)
     monkeypatch.setitem(sys.modules, "headvox.bench.command", bench)
     assert cli.main(["bench", "--repeat", "5", "--debug"]) == 3
     assert got == [["--repeat", "5"]]

@@ -122,9 +122,9 @@ def test_output_files_hold_what_json_prints(recording: Path, anything: Path, tmp
     header, *rows = (tmp_path / "out.csv").read_text().splitlines()
     assert header.startswith("frame,stamp_ns,latency_ms,id,x,y,z,")
     heads = heads_of(done.stdout)
-    assert len(rows) == sum(len(frame) for frame in heads)  # type: ignore[arg-type]
+    assert len(rows) == sum(len(frame) for frame in heads)
     first = dict(zip(header.split(","), rows[0].split(","), strict=True))
-    assert [float(first[axis]) for axis in "xyz"] == heads[0][0]["centre"]  # type: ignore[index]
+    assert [float(first[axis]) for axis in "xyz"] == heads[0][0]["centre"]
     assert first["qx"] == first["id"] == first["vx"] == ""
 
 
@@ -167,12 +167,12 @@ def test_an_output_that_cannot_be_made_is_explained(recording: Path, tmp_path: P
 def test_a_run_tracks_unless_told_not_to(recording: Path, anything: Path) -> None:
     done = headvox("run", recording, "--json", "--cascade", anything)
     lines = heads_of(done.stdout)
-    assert {head["state"] for head in lines[0]} == {"tentative"}  # type: ignore[attr-defined]
-    assert {head["id"] for head in lines[0]} == {None}  # type: ignore[attr-defined]
-    confirmed = [head for head in lines[1] if head["state"] == "confirmed"]  # type: ignore[attr-defined]
+    assert {head["state"] for head in lines[0]} == {"tentative"}
+    assert {head["id"] for head in lines[0]} == {None}
+    confirmed = [head for head in lines[1] if head["state"] == "confirmed"]
     assert [head["id"] for head in confirmed] == list(range(1, len(confirmed) + 1))
     assert len(confirmed) > 0
-    ids = {head["id"] for line in lines for head in line if head["id"] is not None}  # type: ignore[attr-defined]
+    ids = {head["id"] for line in lines for head in line if head["id"] is not None}
     for head in confirmed:
         assert max(map(abs, head["velocity"])) < 0.05  # nothing moves here
     table = headvox("run", recording, "--cascade", anything).stdout
@@ -189,10 +189,10 @@ def test_settings_of_the_tracker_by_flag_and_file(recording: Path, anything: Pat
     assert "\nconfirm_hits = 1\n" in done.stdout
     (tmp_path / "mine.toml").write_text(done.stdout)
     done = headvox("run", recording, "--json", "--limit", 1, "--config", tmp_path / "mine.toml")
-    assert {head["state"] for head in heads_of(done.stdout)[0]} == {"confirmed"}  # type: ignore[attr-defined]
+    assert {head["state"] for head in heads_of(done.stdout)[0]} == {"confirmed"}
     more = ("--config", tmp_path / "mine.toml", "--confirm-hits", 2)
     done = headvox("run", recording, "--json", "--limit", 1, *more)
-    assert {head["state"] for head in heads_of(done.stdout)[0]} == {"tentative"}  # type: ignore[attr-defined]
+    assert {head["state"] for head in heads_of(done.stdout)[0]} == {"tentative"}
     assert_explained(headvox("run", recording, "--confirm-hits", 9), 2)
 
 
@@ -208,7 +208,7 @@ def test_a_trajectory_a_track(recording: Path, anything: Path, tmp_path: Path) -
     (tmp_path / "out_x.tum").write_text("somebody else's\n")
     done = headvox("run", recording, "--json", "--cascade", anything, "-o", tmp_path / "out.tum")
     assert done.returncode == 0, done.stderr
-    confirmed = [head for head in heads_of(done.stdout)[2] if head["id"] is not None]  # type: ignore[attr-defined]
+    confirmed = [head for head in heads_of(done.stdout)[2] if head["id"] is not None]
     names = {path.name for path in tmp_path.iterdir()}
     assert len(confirmed) > 0
     assert names == {"out_x.tum", *(f"out_{head['id']}.tum" for head in confirmed)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,9 @@ def on_line(*x: float) -> np.ndarray:
     return np.array([[value, 0.0, 0.0] for value in x]).reshape(-1, 3)
 
 
-def matched(found: np.ndarray, true: np.ndarray, counted: list[bool] | None = None, **rules: float) -> Match:
+def matched(found: np.ndarray, true: np.ndarray, counted: list[bool] | None = None, **rules: Any) -> Match:
     kept = np.ones(len(true), bool) if counted is None else np.array(counted, bool)
-    return match(found, true, kept, Rules(**rules))  # type: ignore[arg-type]
+    return match(found, true, kept, Rules(**rules))
 
 
 def test_each_head_takes_one_detection_and_the_rest_is_false() -> None:

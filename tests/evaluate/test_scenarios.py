@@ -29,10 +29,13 @@ from headvox.synth.wear import HAIR_STYLES, HATS
 
 
 def all_of(scenario: Scenario) -> list[tuple[Frame, TrueHeads]]:
-    frames = list(scenario.frames())
+    frames = []
+    for frame, true in scenario.frames():
+        assert isinstance(frame, Frame)
+        assert true is not None
+        frames.append((frame, true))
     assert len(frames) == scenario.length
-    assert all(isinstance(frame, Frame) and true is not None for frame, true in frames)
-    return frames  # type: ignore[return-value]
+    return frames
 
 
 def test_a_shell_is_a_head_in_its_own_frame() -> None:

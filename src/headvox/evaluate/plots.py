@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,7 @@ RECALL_BINS_M = np.arange(0.0, 8.5, 0.5)
 def need_matplotlib() -> None:
     """Raise HeadvoxError where matplotlib is not installed."""
     try:
-        import matplotlib  # noqa: F401
+        import_module("matplotlib")
     except ImportError:
         raise MissingExtra("Plots and pictures need matplotlib.", "plot") from None
 

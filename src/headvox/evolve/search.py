@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TypeVar
 
@@ -165,8 +166,8 @@ def _with_verification(settings: Settings, found: Found, say: Say) -> Found:
 def _need_libraries() -> None:
     """Say now what would be missed only when the views are made, which takes hours."""
     try:
-        import cmaes  # noqa: F401
-        import lightgbm  # noqa: F401
+        for name in ("cmaes", "lightgbm"):
+            import_module(name)
     except (ImportError, OSError) as error:  # OSError: LightGBM finds no OpenMP
         raise MissingExtra(f"The search for a cascade needs LightGBM and cmaes: {error}.", "evolve") from None
 

@@ -155,6 +155,7 @@ class Mp4(Film):
         super().__init__(path)
         self._waiting: list[tuple[Image.Image, int]] = []
         self._encoder: subprocess.Popen[bytes] | None = None
+        # It lives as long as the encoder, not as long as a block: discard() closes it.
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
 
     def add(self, picture: Image.Image, stamp_ns: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from easy_search import easy_view, samples_of
 
 from headvox.evolve import again, samples, search, views
@@ -39,12 +40,19 @@ def test_heads_that_the_border_cuts_are_heads_to_the_last_stage_and_dummies_neit
     assert bag.tolist() == [100, 101] + [-1] * 10
 
 
-def test_the_last_stage_is_single_cuts_over_what_was_asked_before(evolved, monkeypatch):
-    folder, found, _ = evolved
+@pytest.fixture
+def on_easy_views(monkeypatch):
     monkeypatch.setattr(search, "keep_view", easy_view)
     monkeypatch.setattr(search, "spoilt_peaks", doubtful_peaks)
+    monkeypatch.setattr(search, "spoilt_looks", doubtful_looks)
     monkeypatch.setattr(again, "LEAST_ROWS", 5)
+    monkeypatch.setattr(last_look, "LEAST_ROWS", 5)
     monkeypatch.setattr(samples, "RANGE_M", 2.8)
+
+
+@pytest.mark.usefixtures("on_easy_views")
+def test_the_last_stage_is_single_cuts_over_what_was_asked_before(evolved):
+    folder, found, _ = evolved
     said: list[str] = []
     more = search._with_second_opinion(search.Settings(folder, 200, "easy"), found, said.append)
     assert said[-1].startswith("asked again: ")
@@ -64,12 +72,9 @@ def test_the_last_stage_needs_heads_and_others():
     assert again.fit_again(again.Peaks(made, score), ["cube5"], seed=0) is None
 
 
-def test_the_last_look_is_fitted_to_spoilt_views_and_written(evolved, monkeypatch):
+@pytest.mark.usefixtures("on_easy_views")
+def test_the_last_look_is_fitted_to_spoilt_views_and_written(evolved):
     folder, found, _ = evolved
-    monkeypatch.setattr(search, "keep_view", easy_view)
-    monkeypatch.setattr(search, "spoilt_looks", doubtful_looks)
-    monkeypatch.setattr(last_look, "LEAST_ROWS", 5)
-    monkeypatch.setattr(samples, "RANGE_M", 2.8)
     said: list[str] = []
     more = search._with_last_look(search.Settings(folder, 200, "easy"), found, said.append)
     assert said[-1].startswith("looked again: ")

@@ -54,9 +54,8 @@ class RealSenseFile:
             config.enable_stream(rs.stream.depth)
             device = config.resolve(rs.pipeline_wrapper(self._pipeline)).get_device()
             self._playback = device.as_playback()
-            self._playback.set_real_time(
-                False
-            )  # before it starts: in real time, what nobody waits for is lost
+            # Before it starts: in real time, what nobody waits for is lost.
+            self._playback.set_real_time(False)
             started = self._pipeline.start(config)
             self._open = True
             serial = device.get_info(rs.camera_info.serial_number)

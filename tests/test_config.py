@@ -5,6 +5,8 @@ import pytest
 
 from headvox.config import DetectorConfig, from_mapping, load_config, to_toml
 from headvox.errors import HeadvoxError
+from headvox.pipeline import Detector
+from headvox.tracking.tracker import Tracker
 
 ROUND = [
     DetectorConfig(),
@@ -113,3 +115,11 @@ def test_from_mapping_names_its_origin():
     with pytest.raises(HeadvoxError, match=r"^flags: unknown setting 'x'"):
         from_mapping({"x": 1}, "flags")
     assert from_mapping({"centre": [1, 2, 3]}, "flags").centre == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize("make", [Detector, Tracker])
+def test_what_is_no_configuration_is_told(make):
+    name = make.__name__ + "Config"
+    with pytest.raises(HeadvoxError, match=f"Expected a {name}, got 'paper'") as told:
+        make("paper")
+    assert told.value.do == f"Write {name}(setting=value)."

@@ -129,6 +129,21 @@ TABLES: dict[type, str] = {DetectorConfig: "detector", TrackerConfig: "track"}
 Config = TypeVar("Config", DetectorConfig, TrackerConfig)
 
 
+def given_or_default(config: Config | None, kind: type[Config]) -> Config:
+    """Return ``config``, or the defaults where there is none.
+
+    Raises:
+        HeadvoxError: it is something else.
+    """
+    if config is None:
+        return kind()
+    if not isinstance(config, kind):
+        raise HeadvoxError(
+            f"Expected a {kind.__name__}, got {_short(config)}.", f"Write {kind.__name__}(setting=value)."
+        )
+    return config
+
+
 def _require(good: bool, key: str, expected: str, got: object) -> None:
     if not good:
         raise HeadvoxError(f"Setting {key}: expected {expected}, got {_short(got)}.", "See `headvox config`.")

@@ -128,6 +128,14 @@ class Heads:
     def __iter__(self) -> Iterator[Head]:
         return (self[n] for n in range(len(self)))
 
+    def __repr__(self) -> str:
+        """Say where each head is and what it scores: all the arrays would fill a screen."""
+        told = [
+            f"({x:.2f}, {y:.2f}, {z:.2f}) m scores {s:.1f}"
+            for (x, y, z), s in zip(self.centres, self.scores, strict=True)
+        ]
+        return f"Heads({len(self)}: {'; '.join(told)})" if told else "Heads(0)"
+
 
 @dataclass(frozen=True, slots=True)
 class Expected:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from headvox.assemble import MOST_POSES, best_apart, stated, with_poses
 from headvox.check import check_frame, knows_an_origin, nothing_in_range
-from headvox.config import DetectorConfig
+from headvox.config import DetectorConfig, given_or_default
 from headvox.cuda.detect import DEVICE_STAGES, OnDevice
 from headvox.cuda.device import BATCH, DeviceLost, use_device
 from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
@@ -70,7 +70,7 @@ class Detector:
         backend: str | None = None,
         note: Callable[[str], None] | None = None,
     ) -> None:
-        self.config = config or DetectorConfig()
+        self.config = given_or_default(config, DetectorConfig)
         if backend is not None:
             self.config = replace(self.config, backend=backend)
         self._note = note or _warn

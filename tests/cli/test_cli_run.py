@@ -13,6 +13,7 @@ import pytest
 from command import COMMAND, assert_explained, heads_of, headvox, headvox_process, parse
 from inputs import write_recording
 
+from headvox.commands import session
 from headvox.commands.flags import TRACKER_FLAGS
 from headvox.config import TrackerConfig
 
@@ -58,6 +59,15 @@ def test_the_same_heads_again_and_with_two_threads(recording: Path, anything: Pa
     for done in (headvox_process(*command, 1), headvox_process(*command, 2)):
         assert (done.returncode, done.stderr) == (0, "")
         assert json.dumps(heads_of(first.stdout)) == json.dumps(heads_of(done.stdout))
+
+
+def test_the_first_run_says_why_it_is_silent(
+    recording: Path, anything: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "kept_loops", lambda: 0)
+    done = headvox("run", recording, "--cascade", anything)
+    assert done.returncode == 0
+    assert done.stderr == "the first run compiles its loops, for half a minute or so, and keeps them\n"
 
 
 def test_limit_stops_early(recording: Path) -> None:

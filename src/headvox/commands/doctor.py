@@ -141,7 +141,7 @@ def _gpu() -> Check:
 
 def _cameras() -> Check:
     if importlib.util.find_spec("pyrealsense2") is None:
-        return Check("RealSense", "no pyrealsense2: pip install pyrealsense2, for live cameras")
+        return Check("RealSense", "cannot be asked without the extra")
     done = _python(CAMERAS, SHORT_S)
     if done is None or done.returncode:
         return Check("RealSense", f"cannot be asked: {_last_line(done)}")

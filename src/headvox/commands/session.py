@@ -22,7 +22,7 @@ from headvox.sources import Source, open_source
 from headvox.sources.recording import RecordingSource
 from headvox.sources.remote import fetched
 from headvox.tracking.tracker import Tracker
-from headvox.warmup import warm_up
+from headvox.warmup import kept_loops, warm_up
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,9 @@ class Session:
             if on_result is not None:
                 on_result(frame, result)
 
-        self.live.show("getting ready (the first time compiles, for half a minute or so)")
+        if kept_loops() == 0:  # also where nobody watches: silence for so long looks like a hang
+            self.live.note("the first run compiles its loops, for half a minute or so, and keeps them")
+        self.live.show("getting ready")
         warm_up(self.config)
         with closing(Skipped(self.live.note)) as skipped:
             report = run(

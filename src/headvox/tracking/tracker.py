@@ -13,7 +13,7 @@ from collections import Counter
 
 import numpy as np
 
-from headvox.config import TrackerConfig
+from headvox.config import TrackerConfig, given_or_default
 from headvox.data import F64, I64, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
 from headvox.tracking.identity import MOST_STRENGTH, come_back, note_sightings, pairs, price
@@ -61,7 +61,7 @@ class Tracker:
     """
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
-        self.config = config or TrackerConfig()
+        self.config = given_or_default(config, TrackerConfig)
         self.untracked: Counter[str] = Counter()
         self.stamp_ns: int | None = None
         """Of the last frame that was tracked."""

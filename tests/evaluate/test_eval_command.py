@@ -246,8 +246,9 @@ def test_without_motmetrics_nothing_is_begun_that_needs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "motmetrics", None)
     monkeypatch.setattr("headvox.evaluate.command._show", lambda *_: pytest.fail("a frame was looked at"))
-    assert main(["eval", "rotation"]) == 1
-    assert "pip install 'headvox[eval]'" in capsys.readouterr().err
+    for what in ("rotation", "sample", str(headvox.sample_folder())):
+        assert main(["eval", what]) == 1
+        assert "pip install 'headvox[eval]'" in capsys.readouterr().err
 
 
 def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,8 +103,8 @@ def _report(args: argparse.Namespace) -> int:
     recorded: dict[str, list[Outcome]] = {}
     with closing(Live(sys.stderr, None)) as live:
         scenarios = _scenarios(args, live)
-        if plan.tracker is not None and any(scenario.synthetic and scenario.moving for scenario in scenarios):
-            need_motmetrics()  # these have ids
+        if plan.tracker is not None and any(scenario.identified for scenario in scenarios):
+            need_motmetrics()  # before hours of work, not after
         if args.scheduler is None:
             # One after the other, each told of as it goes: whoever times a detector has the machine to himself.
             outcomes: Iterable[tuple[Scenario, list[Outcome]]] = (

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from headvox.data import F64, BadFrame, Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.evaluate.match import Rules
-from headvox.evaluate.truth import FILE, TrueHeads, read_truth
+from headvox.evaluate.truth import FILE, NO_ID, TrueHeads, read_truth
 from headvox.parallel.workers import ALONE, Workers
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ class Scenario:
     """Whether a frame follows on the one before."""
     rules: Rules | None = None
     """What counts here, where that is part of the scenario."""
+    identified: bool = False
+    """Whether it is told who is who, in every frame: how well identities are kept can be scored."""
 
 
 def static(identities: int = 44, turns: int = 100, seed: int = 0) -> Scenario:
@@ -70,7 +72,7 @@ def rotation(every: int = 1, revolutions: float = 1.0, seed: int = 0) -> Scenari
     """
     count = round(revolutions * 2.0 * np.pi / TURN_RAD_S * CLOUD_RATE_HZ / every)
     name = "rotation" if every == 1 else f"rotation, every {every}th"
-    return Scenario(name, count, partial(_rotation, every, count, seed), synthetic=True)
+    return Scenario(name, count, partial(_rotation, every, count, seed), synthetic=True, identified=True)
 
 
 def _rotation(every: int, count: int, seed: int) -> Iterator[Labelled]:
@@ -105,7 +107,7 @@ def two_cameras(
     ``people`` of them are there at a time; ``frames`` at 10 Hz of each of ``walkers`` scenes, one in a room of its own.
     """
     make = partial(_two_cameras, walkers, frames, people, seed, workers)
-    return Scenario("two-cameras", walkers * frames, make, synthetic=True)
+    return Scenario("two-cameras", walkers * frames, make, synthetic=True, identified=True)
 
 
 def _two_cameras(walkers: int, frames: int, people: int, seed: int, workers: Workers) -> Iterator[Labelled]:
@@ -149,7 +151,7 @@ def recording(path: Path) -> Scenario:
     """
     from headvox.sources import open_source
 
-    _truth_of(path)
+    ids = [who for true in _truth_of(path).values() for who in true.ids.tolist()]
     source = open_source(path)
     source.close()
     return Scenario(
@@ -158,6 +160,7 @@ def recording(path: Path) -> Scenario:
         partial(_recorded, path.absolute()),
         synthetic=False,
         recording=source.name,
+        identified=len(ids) > 0 and NO_ID not in ids,
     )
 
 

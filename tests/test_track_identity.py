@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from walks import STANDING, at, follow, heads, walk
 
+from headvox.data import Heads
 from headvox.pipeline import Detector
 from headvox.sources import open_source
 from headvox.tracking.tracker import Tracker
@@ -83,18 +84,47 @@ def test_what_is_expected_is_where_confirmed_heads_will_be() -> None:
     assert len(tracker.expected(at(3).stamp_ns)) == 0  # a late frame is not tracked
 
 
+def looking(yaw_rad: float, sigma_rad: float) -> Heads:
+    """A head whose yaw, as the detector tells it, is so sure."""
+    turn = np.array([[0.0, 0.0, np.sin(0.5 * yaw_rad), np.cos(0.5 * yaw_rad)]])
+    spread = np.diag([0.05, 0.05, sigma_rad])[None] ** 2
+    return replace(heads(STANDING[0]), quaternions=turn, rotation_covariances=spread)
+
+
 def test_expected_orientations_are_the_same_where_rounding_errors_differ() -> None:
     """A fit that starts from one would make more of them, and so on from frame to frame."""
     expected = []
     for error in (0.0, 1e-13):
         tracker = Tracker()
         for k in range(10):
-            yaw = 0.3 + 0.01 * k + error
-            head = replace(heads(STANDING[0]), quaternions=np.array([[0, 0, np.sin(yaw), np.cos(yaw)]]))
-            tracker.update(head, at(k))
+            tracker.update(looking(0.6 + 0.02 * k + error, 0.1), at(k))
         expected.append(tracker.expected(at(10).stamp_ns).quaternions)
     np.testing.assert_array_equal(*expected)
     assert np.linalg.norm(expected[0]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_an_orientation_that_is_not_sure_is_not_expected() -> None:
+    """The fit that started from it would look at no other, and confirm it in every frame."""
+    for sigma, expected in ((0.05, True), (0.5, False)):
+        tracker = Tracker()
+        for k in range(4):
+            tracker.update(looking(0.3, sigma), at(k))
+        assert np.isfinite(tracker.expected(at(4).stamp_ns).quaternions[0, 3]) == expected
+
+
+def test_an_orientation_that_was_not_seen_for_long_is_not_stated() -> None:
+    tracker = Tracker()
+    for k in range(10):
+        tracks = tracker.update(looking(0.3, 0.1), at(k))
+    assert np.degrees(2.0 * np.arcsin(tracks.quaternions[0, 2])) == pytest.approx(np.degrees(0.3), abs=0.1)
+    stated = []
+    for k in range(10, 40):
+        tracks = tracker.update(heads(STANDING[0]), at(k))
+        stated.append(bool(np.isfinite(tracks.quaternions[0]).all()))
+        assert np.isfinite(tracks.rotation_covariances[0]).all() == stated[-1]
+    assert stated[0]
+    assert not stated[-1]
+    assert sorted(stated, reverse=True) == stated
 
 
 @pytest.mark.skipif(not FILINHA.is_dir(), reason="no shared/data beside the checkout")

@@ -6,6 +6,7 @@ import numpy as np
 
 from headvox.data import Expected, Heads, State, Tracks
 from headvox.machine.kernels import kernel
+from headvox.pose.settle import SURE_YAW_RAD
 from headvox.tracking.kalman import combine, widest
 from headvox.tracking.roster import Roster
 
@@ -13,12 +14,15 @@ TENTATIVE, CONFIRMED, COASTING = int(State.TENTATIVE), int(State.CONFIRMED), int
 LEAST_REACH_M, MOST_REACH_M = 0.12, 0.4  # about an expected place
 # Of a quaternion that a fit starts from: its rounding errors must not grow from frame to frame.
 EXPECTED_DIGITS = 1e3
+# A fit that starts from a yaw that is less sure than this looks at no other, and would confirm it, wrong or not.
+EXPECTED_YAW_RAD = np.radians(10.0)
 
 
 def report(roster: Roster, last_ns: int, stamp_ns: int) -> Tracks:
     """Return the living as tracks, those with an id first.
 
-    One that is absent is not stated, and a tentative one only where it was seen at ``last_ns``.
+    One that is absent is not stated, and a tentative one only where it was seen at ``last_ns``. An orientation whose
+    yaw is less sure than ``SURE_YAW_RAD`` is not stated either, as the detector has it.
 
     ``last_ns`` is the stamp of the last frame, ``stamp_ns`` the moment to which ``roster`` was predicted.
     """
@@ -41,9 +45,10 @@ def report(roster: Roster, last_ns: int, stamp_ns: int) -> Tracks:
 def expectations(roster: Roster) -> Expected:
     """Return where the living that have an id are expected, in rows that were predicted.
 
-    Orientations are rounded to a tenth of a degree. A fit that starts from one may end degrees away from that which
-    starts beside it, where the points say little of the yaw, and the next frame starts from there: without this,
-    poses of a camera that differ by 1e-16 made heads differ by centimetres 50 frames later.
+    Only an orientation whose yaw is sure to ``EXPECTED_YAW_RAD`` is expected, and to a tenth of a degree. A fit that
+    starts from one may end degrees away from that which starts beside it, where the points say little of the yaw, and
+    the next frame starts from there: without this, poses of a camera that differ by 1e-16 made heads differ by
+    centimetres 50 frames later.
     """
     n = len(roster)
     expected = Expected(np.empty((n, 3)), np.empty((n, 4)), np.empty(n))
@@ -96,14 +101,14 @@ def copy_out(
             states[k] = TENTATIVE
         ages_s[k] = (stamp_ns - row.born_ns) * 1e-9
         unseen_s[k] = (stamp_ns - row.seen_ns) * 1e-9
-        known = not np.isnan(row.q[3])
+        known = row.C[2, 2] < SURE_YAW_RAD * SURE_YAW_RAD and not np.isnan(row.q[3])
         for a in range(3):
             centres[k, a], velocities[k, a] = mean[a], mean[3 + a]
             rates[k, a] = row.rate[a] if known else np.nan
             for b in range(3):
                 turns[k, a, b] = row.C[a, b] if known else np.nan
         for a in range(4):
-            quaternions[k, a] = row.q[a]
+            quaternions[k, a] = row.q[a] if known else np.nan
 
 
 @kernel
@@ -118,8 +123,9 @@ def expect(roster, centres, quaternions, reaches_m):
         combine(row, mean, cov)
         for a in range(3):
             centres[count, a] = mean[a]
+        sure = row.C[2, 2] < EXPECTED_YAW_RAD * EXPECTED_YAW_RAD
         for a in range(4):
-            quaternions[count, a] = np.rint(row.q[a] * EXPECTED_DIGITS) / EXPECTED_DIGITS
+            quaternions[count, a] = np.rint(row.q[a] * EXPECTED_DIGITS) / EXPECTED_DIGITS if sure else np.nan
         reaches_m[count] = min(max(3.0 * widest(cov), LEAST_REACH_M), MOST_REACH_M)
         count += 1
     return count

@@ -28,16 +28,19 @@ from headvox.relief import relief_about
 LEAST_SCORE = -5.0  # of the peaks that are looked at
 MOST_SPOTS = 72  # chosen by what a short boosting over all gains from them
 CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE = 100, 0.15, 0.2
-TREES, RATE, SHARE_OF_FEATURES = 300, 0.1, 0.3
-LEAVES, LEAST_ROWS = 16, 60
+TREES, RATE, SHARE_OF_FEATURES = 300, 0.1, 0.15
+LEAVES, DEEPEST, LEAST_ROWS = 64, 8, 60
 TURNS = 3  # how often each view is taken
-MOST = 2.0  # how far the score may change
+MOST = 3.0  # how far the score may change
 
 FINE_CM = [(side, up) for side in range(0, 16, 3) for up in range(-15, 16, 3)]
 COARSE_CM = [(side, up) for side in range(0, 37, 6) for up in range(-60, 31, 6)]
+WIDE_CM = [
+    (side, up) for side in range(0, 61, 15) for up in range(-105, 61, 15) if side > 36 or not -60 <= up <= 30
+]
 SPOTS = tuple(
     Spot(f"s{side:02d}{'u' if up >= 0 else 'd'}{abs(up):02d}", side / 100, up / 100)
-    for side, up in dict.fromkeys(FINE_CM + COARSE_CM)
+    for side, up in dict.fromkeys(FINE_CM + COARSE_CM + WIDE_CM)
 )
 PLACES: F64 = np.array([(spot.side, spot.up) for spot in SPOTS])
 
@@ -88,7 +91,7 @@ def fit_relief(looks: Looks, seed: int) -> Relief | None:
         return None
 
     def fit(columns: npt.NDArray[np.int64], trees: int, rate: float, share: float) -> Any:
-        settings = {"num_leaves": LEAVES, "min_data_in_leaf": LEAST_ROWS}
+        settings = {"num_leaves": LEAVES, "max_depth": DEEPEST, "min_data_in_leaf": LEAST_ROWS}
         features = looks.relief[:, columns].astype(np.float32)
         return train(features, looks.label, looks.score, None, trees, rate, share, seed, settings)
 

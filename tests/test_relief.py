@@ -9,6 +9,7 @@ import scenes
 from headvox.config import DetectorConfig
 from headvox.data import Cloud, DepthImage, Expected, Frame, Intrinsics
 from headvox.errors import HeadvoxError
+from headvox.evolve.write import relief_lines
 from headvox.frames import unproject
 from headvox.masks.cascade import Relief, Spot
 from headvox.masks.compile import CompiledRelief, compile_cascade
@@ -207,6 +208,22 @@ def test_where_a_head_is_expected_less_is_enough(tmp_path, sample):
             "[relief]\nmost = 1\ntrees = [['b.near', 0, 1, 2]]\nspots = { a = [0, 0] }",
             "relief.trees: expected",
         ),
+        *(
+            (
+                f"[relief]\nmost = 1\ntrees = ['{words}']\nspots = {{ a = [0, 0] }}",
+                f"relief.trees: expected {said}",
+            )
+            for words, said in (
+                ("", "a leaf, or a feature"),
+                ("b.near 0 1 2", "a leaf, or a feature"),
+                ("a.near 0 1", "a leaf, or a feature"),
+                ("a.near a.far 1 2", "a number from -1e\\+09"),
+                ("a.near nan 1 2", "a number from -1e\\+09"),
+                ("a.near 0 1 2000", "a number from -1000"),
+                ("a.near 0 1 2 3", "one tree in a text"),
+                ("a.near 0 " * 40 + "1 " * 41, "a leaf, or a feature of this file, 30 deep"),
+            )
+        ),
         ("[relief]\nmost = 1\ntrees = 4\nspots = { a = [0, 0] }", "relief.trees: expected a list"),
         ("[relief]\nmost = 1\ntrees = []\nspots = { a = [0, 0] }\nelse = 1", "relief: expected only"),
     ],
@@ -217,6 +234,17 @@ def test_a_relief_that_is_none_is_told_in_one_line(relief, said):
         parse_cascade(text, "x")
 
 
+def test_a_tree_in_words_is_the_same_tree():
+    spots = "spots = { a = [0, 0] }"
+    lists = BEFORE + f"[relief]\nmost = 1\ntrees = [['a.near', 0.5, -1, ['range', 2, 0.25, 3]], 0.5]\n{spots}"
+    words = BEFORE + f"[relief]\nmost = 1\ntrees = ['a.near 0.5 -1 range 2 0.25 3', '0.5']\n{spots}"
+    read = parse_cascade(lists, "x")
+    assert parse_cascade(words, "x") == read
+    written = "\n".join(relief_lines(read.relief))
+    assert "'a.near 0.5 -1 range 2 0.25 3'" in written
+    assert parse_cascade(BEFORE + written, "x") == read
+
+
 def test_the_last_look_is_described():
     told = describe_cascade(load_cascade("default"))
-    assert "The last look, in depth images: 300 trees over 72 pairs of spots" in told
+    assert "The last look, in depth images: 400 trees over 72 pairs of spots" in told

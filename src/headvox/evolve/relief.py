@@ -28,8 +28,8 @@ from headvox.relief import relief_about
 LEAST_SCORE = -5.0  # of the peaks that are looked at
 MOST_SPOTS = 72  # chosen by what a short boosting over all gains from them
 CHOOSING_TREES, CHOOSING_RATE, CHOOSING_SHARE = 100, 0.15, 0.2
-TREES, RATE, SHARE_OF_FEATURES = 300, 0.1, 0.15
-LEAVES, DEEPEST, LEAST_ROWS = 64, 8, 60
+TREES, RATE, SHARE_OF_FEATURES = 400, 0.08, 0.15
+LEAVES, DEEPEST, LEAST_ROWS = 96, 10, 60
 TURNS = 3  # how often each view is taken
 MOST = 3.0  # how far the score may change
 

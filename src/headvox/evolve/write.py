@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from headvox.atomic import write_text
 from headvox.evolve.bank import OCCUPIED, SEEN, SUBDIVISION, VOXEL_M
 from headvox.evolve.boost import Fitted
-from headvox.masks.cascade import Condition, Group, Relief, Verification
+from headvox.masks.cascade import Condition, Group, Relief, Tree, Verification
 
 WHY = {
     "crown": "the upper half is there", "beside": "about the crown there is less than in it",
@@ -97,8 +97,16 @@ def relief_lines(relief: Relief | None) -> list[str]:
     if relief is None:
         return []
     spots = [f"{spot.name} = [{spot.side:g}, {spot.up:g}]" for spot in relief.spots]
-    trees = [f"  {json.dumps(tree)}," for tree in relief.trees]
+    trees = [f"  '{' '.join(_words(tree))}'," for tree in relief.trees]
     return ["[relief]", f"most = {relief.most:g}", "trees = [", *trees, "]", "", "[relief.spots]", *spots, ""]
+
+
+def _words(tree: Tree) -> Iterator[str]:
+    if not isinstance(tree, tuple):
+        yield f"{tree:g}"
+        return
+    name, cut, below, above = tree
+    yield from (name, f"{cut:.10g}", *_words(below), *_words(above))
 
 
 def verification_lines(rule: Verification | None) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import fields
 from importlib import resources
@@ -41,6 +42,7 @@ SPACINGS = {"all": 1, "every other": 2, "every fourth": 4}
 MAX_FILE_BYTES = 8 << 20
 MAX_EXTENT_M = 2.0
 MOST_SPOTS = 256
+DEEPEST_TREE = 30
 LARGEST = 1e9  # of shares and scores: their sums stay far within 64 bits
 
 
@@ -85,6 +87,13 @@ def parse_cascade(text: str, origin: str) -> Cascade:
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, or a whole number of too many digits
         raise HeadvoxError(f"Cascade {origin} is not TOML: {error}.", "Check that line.") from None
     return _Reader(origin).cascade(table)
+
+
+def _as_number(word: str) -> float | str:
+    try:
+        return float(word)
+    except ValueError:
+        return word
 
 
 class _Reader:
@@ -220,22 +229,45 @@ class _Reader:
         )
 
     def tree(self, value: object, features: set[str], where: str, depth: int = 0) -> Tree:
+        if isinstance(value, str) and depth == 0:
+            return self.tree_of_words(iter(value.split()), features, where)
         if not isinstance(value, list):
             return self.number(value, where, -1000.0, 1000.0)
-        if len(value) != 4 or depth > 30:
-            raise self.error(where, "[feature, cut, at most, above], 30 deep at most", value)
-        feature = self.text(value[0], where)
-        if feature not in features:
+        if len(value) != 4 or depth > DEEPEST_TREE:
+            raise self.error(where, f"[feature, cut, at most, above], {DEEPEST_TREE} deep at most", value)
+        feature, cut, *branches = value
+        below, above = (self.tree(branch, features, where, depth + 1) for branch in branches)
+        return self.feature(feature, features, where), self.number(cut, where), below, above
+
+    def tree_of_words(self, words: Iterator[str], features: set[str], where: str) -> Tree:
+        """Return a tree in prefix notation: a feature, its cut, the branch at most the cut, that above; or a leaf.
+
+        A megabyte of such text is read in a tenth of the time that TOML's nested lists take.
+        """
+        tree = self.branch(words, features, where, 0)
+        more = next(words, None)
+        if more is not None:
+            raise self.error(where, "one tree in a text", more)
+        return tree
+
+    def branch(self, words: Iterator[str], features: set[str], where: str, depth: int) -> Tree:
+        word = next(words, "")
+        if word in features and depth <= DEEPEST_TREE:
+            cut = self.number(_as_number(next(words, "")), where)
+            below = self.branch(words, features, where, depth + 1)
+            return word, cut, below, self.branch(words, features, where, depth + 1)
+        leaf = _as_number(word)
+        if isinstance(leaf, str):
+            raise self.error(where, f"a leaf, or a feature of this file, {DEEPEST_TREE} deep at most", leaf)
+        return self.number(leaf, where, -1000.0, 1000.0)
+
+    def feature(self, value: object, features: set[str], where: str) -> str:
+        name = self.text(value, where)
+        if name not in features:
             raise self.error(
-                where, "a statistic of a group, a side of a spot of this file, or a measure", feature
+                where, "a statistic of a group, a side of a spot of this file, or a measure", name
             )
-        cut = self.number(value[1], where)
-        return (
-            feature,
-            cut,
-            self.tree(value[2], features, where, depth + 1),
-            self.tree(value[3], features, where, depth + 1),
-        )
+        return name
 
     def stage(self, value: object, features: set[str]) -> tuple[Stage, str]:
         """Return a stage, and where it looks: at "candidates", "peaks" or "both"."""

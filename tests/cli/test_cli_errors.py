@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,18 @@ def test_wrong_usage_ends_with_2(arguments: tuple[str, ...]) -> None:
     assert done.stdout == ""
     assert "error: " in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_library_of_the_system_that_is_missing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    done = headvox("run", "realsense:")
+    assert_explained(done)
+    assert "libusb-1.0.so.0: cannot open" in done.stderr
+    assert "apt install libusb-1.0-0" in done.stderr
 
 
 def test_debug_shows_the_trace(tmp_path: Path) -> None:

@@ -17,7 +17,11 @@ from headvox.sources.describe import describe
 from headvox.sources.extrinsics import read_extrinsics
 from headvox.sources.options import SourceOptions, mount, mounted
 
-rs = pytest.importorskip("pyrealsense2", reason="there is no pyrealsense2 for this machine")
+rs = pytest.importorskip(
+    "pyrealsense2",
+    reason="pyrealsense2 does not load here: there is none for this machine, or libusb is missing",
+    exc_type=ImportError,
+)
 
 WIDTH, HEIGHT = 64, 48
 START_MS = 1_700_000_000_000.0

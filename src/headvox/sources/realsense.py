@@ -229,8 +229,12 @@ class RealSenseLive:
 def _pyrealsense2() -> Any:
     try:
         import pyrealsense2
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingExtra("RealSense cameras need the package 'pyrealsense2'.", "realsense") from None
+    except ImportError as error:  # a library of the system is missing
+        raise HeadvoxError(
+            f"The package 'pyrealsense2' cannot be loaded: {error}.", "On Debian: apt install libusb-1.0-0"
+        ) from None
     return pyrealsense2
 
 

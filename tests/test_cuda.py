@@ -30,7 +30,7 @@ def there_is_a_gpu() -> bool:
 
 
 GPU = there_is_a_gpu()
-without_gpu = pytest.mark.skipif(GPU, reason="there is a GPU")
+without_gpu = pytest.mark.skipif(GPU, reason="there is a GPU: this is about machines without")
 
 
 def run_pytest(*files: str, **environment: str) -> None:

@@ -149,10 +149,15 @@ def flat(shade: int) -> Image.Image:
 def test_after_an_error_the_older_file_is_still_there(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"film{suffix}"
     path.write_bytes(b"old")
-    with pytest.raises(ZeroDivisionError), open_film(path) as film:  # noqa: PT012
-        for n in range(12):
-            film.add(flat(n), 100_000_000 * n)
-        raise ZeroDivisionError
+
+    def film_and_fail() -> None:
+        with open_film(path) as film:
+            for n in range(12):
+                film.add(flat(n), 100_000_000 * n)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        film_and_fail()
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

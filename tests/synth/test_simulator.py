@@ -25,7 +25,7 @@ def simulator(scene):
     try:
         simulator = Simulator(scene)
     except HeadvoxError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"MuJoCo cannot render on this machine: {error}")
     yield simulator
     simulator.close()
 

@@ -170,10 +170,14 @@ def test_ten_frames_a_second_are_shown(found, monkeypatch, tmp_path, hz, every, 
 
 def test_a_child_that_ends_is_told() -> None:
     mailbox = Mailbox(["-c", "pass"])
-    with pytest.raises(HeadvoxError, match="The viewer has ended"):  # noqa: PT012
+
+    def put_until_told() -> None:
         for _ in range(200):
             mailbox.put((0, np.zeros(100_000)))
             time.sleep(0.05)
+
+    with pytest.raises(HeadvoxError, match="The viewer has ended"):
+        put_until_told()
     mailbox.close()
 
 

@@ -43,7 +43,9 @@ def heard(robot, start, sample):
     )
     robot.wait(lambda: player.process.poll() is not None)
     heads, truth = robot.got["/head_detector/heads"], robot.got["/true_heads"]
-    robot.wait(lambda: heads and stamp_of(heads[-1]) == stamp_of(truth[-1]))  # nothing newer replaces the last
+    robot.wait(
+        lambda: heads and stamp_of(heads[-1]) == stamp_of(truth[-1])
+    )  # nothing newer replaces the last
     told = len(robot.got["/diagnostics"])
     robot.wait(lambda: len(robot.got["/diagnostics"]) > told + 1)  # one that was begun after the last answer
     assert player.wait()[0] == 0

@@ -66,8 +66,11 @@ def relief_about(images, centres, radii, spots):
     return table
 
 
-def gain(relief_mm, source):
-    """What the trees of ``source`` (headvox.masks.cascade.Relief) say of one row, in steps of 1/1024."""
+def gain(relief_mm, source, lacking):
+    """What the trees of ``source`` (headvox.masks.cascade.Relief) say of one row, in steps of 1/1024.
+
+    One that is ``lacking`` more than the reach after the first trees is given up.
+    """
     names = [f"{spot.name}.{side}" for spot in source.spots for side in ("near", "far")]
     names += ["range", "rise", "height", "radius"]
     metres = {name: value / 1000.0 for name, value in zip(names, relief_mm.tolist(), strict=True)}
@@ -79,4 +82,11 @@ def gain(relief_mm, source):
         return round(1024 * tree)
 
     most = math.floor(1024 * source.most)
-    return max(-most, min(most, sum(leaf(tree) for tree in source.trees)))
+
+    def limited(total):
+        return max(-most, min(most, total))
+
+    first = limited(sum(leaf(tree) for tree in source.trees[: source.first]))
+    if first / 1024 + source.reach < lacking / 1024:
+        return first
+    return limited(sum(leaf(tree) for tree in source.trees))

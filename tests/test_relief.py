@@ -118,6 +118,7 @@ def test_what_is_not_known_is_neither_free_nor_in_front():
 def test_the_trees_of_the_default_add_up_as_the_naive_twin_says():
     source = load_cascade("default").relief
     assert source is not None
+    source = replace(source, first=40, reach=0.4)
     rng = np.random.default_rng(3)
     images = turned_images(2)
     centres = np.array(
@@ -125,20 +126,43 @@ def test_the_trees_of_the_default_add_up_as_the_naive_twin_says():
     )
     relief = compiled(source)
     radii = rng.uniform(0.05, 0.15, len(centres))
-    gains = gains_of(images, centres, radii, relief)
     seen, best = relief_about(images, centres, radii, relief.spots)
-    wanted = [naive_relief.gain(row, source) if there else 0 for row, there in zip(seen, best, strict=True)]
-    assert gains.tolist() == wanted
-    assert len(set(wanted)) > 10
+    never = np.full(len(centres), -9000)
+    said = []
+    for lacking in (never, rng.integers(-3000, 9000, len(centres))):
+        rows = zip(seen, best, lacking.tolist(), strict=True)
+        wanted = [naive_relief.gain(row, source, lacks) if there else 0 for row, there, lacks in rows]
+        assert gains_of(images, centres, radii, lacking, relief).tolist() == wanted
+        assert len(set(wanted)) > 10
+        said.append(wanted)
+    assert said[0] != said[1]
+
+
+@pytest.mark.parametrize(("lacking", "gained"), [(1023, 0.75), (1024, 0.75), (1025, 0.5)])
+def test_what_lacks_too_much_after_the_first_trees_is_given_up(lacking, gained):
+    image = sphere_before_a_wall(scenes.looking_along_x(-1.2, 0.0, 0.0))
+    relief = compiled(Relief(2.0, (Spot("s", 0.0, 0.0),), (0.5, 0.25), first=1, reach=0.5))
+    lacks = np.array([lacking])
+    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, relief).tolist() == [1024 * gained]
+
+
+def test_no_tree_is_given_up_unless_the_file_says_so():
+    read = parse_cascade(BEFORE + "[relief]\nmost = 1\ntrees = [0.5]\nspots = { a = [0, 0] }", "x")
+    assert read.relief is not None
+    assert (read.relief.first, read.relief.reach) == (0, np.inf)
+    image = sphere_before_a_wall(scenes.looking_along_x(-1.2, 0.0, 0.0))
+    lacks = np.array([1024])  # all that the trees may change
+    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, compiled(read.relief)).tolist() == [512]
 
 
 @pytest.mark.parametrize(("leaf", "gained"), [(0.5, 0.5), (9.0, 1.0), (-9.0, -1.0)])
 def test_the_score_changes_by_no_more_than_the_cascade_allows(leaf, gained):
     image = sphere_before_a_wall(scenes.looking_along_x(-1.2, 0.0, 0.0))
     relief = compiled(Relief(1.0, (Spot("s", 0.0, 0.0),), (leaf,)))
-    assert gains_of((image,), np.zeros((1, 3)), RADIUS, relief).tolist() == [1024 * gained]
-    assert gains_of((image,), np.full((1, 3), 9.0), RADIUS, relief).tolist() == [0]  # out of view
-    assert gains_of((), np.zeros((1, 3)), RADIUS, relief).tolist() == [0]
+    lacks = np.zeros(1, np.int64)
+    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, relief).tolist() == [1024 * gained]
+    assert gains_of((image,), np.full((1, 3), 9.0), RADIUS, lacks, relief).tolist() == [0]  # out of view
+    assert gains_of((), np.zeros((1, 3)), RADIUS, lacks, relief).tolist() == [0]
 
 
 @pytest.fixture(scope="module")
@@ -205,6 +229,14 @@ def test_where_a_head_is_expected_less_is_enough(tmp_path, sample):
             "relief.most: expected a number from 0 to 1000",
         ),
         (
+            "[relief]\nmost = 1\nfirst = 2\ntrees = [1]\nspots = { a = [0, 0] }",
+            "relief.first: expected a whole number from 0 to 1, got 2",
+        ),
+        (
+            "[relief]\nmost = 1\nreach = -1\ntrees = [1]\nspots = { a = [0, 0] }",
+            "relief.reach: expected a number from 0 to inf",
+        ),
+        (
             "[relief]\nmost = 1\ntrees = [['b.near', 0, 1, 2]]\nspots = { a = [0, 0] }",
             "relief.trees: expected",
         ),
@@ -241,6 +273,7 @@ def test_a_tree_in_words_is_the_same_tree():
     read = parse_cascade(lists, "x")
     assert parse_cascade(words, "x") == read
     written = "\n".join(relief_lines(read.relief))
+    assert "first = 0\nreach = inf\n" in written
     assert "'a.near 0.5 -1 range 2 0.25 3'" in written
     assert parse_cascade(BEFORE + written, "x") == read
 

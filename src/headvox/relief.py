@@ -157,23 +157,36 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):
         relief[i, 2 * count], relief[i, 2 * count + 1] = in_mm(away), in_mm(dz / away)
 
 
+@bare_kernel
+def sum_of_leaves(measured, nodes, roots, deepest, at):
+    """Return what the trees of ``roots`` (T,) say of what was ``measured`` (2 K + 4,); ``at`` (T,) is for its use."""
+    for t in range(roots.shape[0]):
+        at[t] = roots[t]
+    for _ in range(deepest):  # all trees, a step at a time: no step has to wait for the one before
+        for t in range(np.uint64(roots.shape[0])):
+            node = at[t]
+            at[t] = nodes[node + 2 + (measured[nodes[node]] > nodes[node + 1])]
+    total = np.int64(0)
+    for t in range(roots.shape[0]):
+        total += nodes[at[t] + 1]
+    return total
+
+
 @kernel
-def add_trees(relief, best, nodes, roots, deepest, most, gains):
+def add_trees(relief, best, nodes, roots, deepest, first, reach, most, lacking, gains):
     """Write what the trees say of each row of ``relief`` (N, 2 K + 4) to ``gains`` (N,), at most ``most`` either way.
 
+    Where the ``first`` trees leave more than ``reach`` of what is ``lacking`` (N,) to be a head, no others are asked.
     Of what no camera saw (``best`` (N,) is 0) they say nothing.
     """
     at = np.empty_like(roots)
     for i in range(relief.shape[0]):
-        total = np.int64(0)
-        if best[i] > 0.0:
-            at[:] = roots
-            for _ in range(deepest):  # all trees, a step at a time: no step has to wait for the one before
-                for t in range(np.uint64(roots.shape[0])):
-                    node = at[t]
-                    at[t] = nodes[node + 2 + (relief[i, nodes[node]] > nodes[node + 1])]
-            for t in range(roots.shape[0]):
-                total += nodes[at[t] + 1]
+        gains[i] = 0
+        if not best[i] > 0.0:
+            continue
+        total = sum_of_leaves(relief[i], nodes, roots[:first], deepest, at[:first])
+        if min(max(total, -most), most) + reach >= lacking[i]:
+            total += sum_of_leaves(relief[i], nodes, roots[first:], deepest, at[first:])
         gains[i] = min(max(total, -most), most)
 
 
@@ -192,16 +205,20 @@ def relief_about(images: Sequence[DepthImage], centres: F64, radii: F64, spots: 
     return relief, best
 
 
-def gains_of(images: Sequence[DepthImage], centres: F64, radii: F64, relief: CompiledRelief) -> I64:
+def gains_of(
+    images: Sequence[DepthImage], centres: F64, radii: F64, lacking: I64, relief: CompiledRelief
+) -> I64:
     """Return by how much the scores of candidates change, in steps: 0 where no camera sees them.
 
-    ``centres`` (N, 3), world, and ``radii`` (N,) are in metres.
+    ``centres`` (N, 3), world, and ``radii`` (N,) are in metres; ``lacking`` (N,) is how much each scores too little to
+    be a head, in steps. Of one that still lacks too much after the first trees, what these say is all.
     """
     seen, best = relief_about(
         images, np.ascontiguousarray(centres), np.ascontiguousarray(radii), relief.spots
     )
-    gains = np.zeros(len(centres), np.int64)
-    add_trees(seen, best, relief.nodes, relief.root, relief.deepest, relief.most, gains)
+    gains = np.empty(len(centres), np.int64)
+    trees = (relief.nodes, relief.root, relief.deepest, relief.first, relief.reach, relief.most)
+    add_trees(seen, best, *trees, lacking, gains)
     return gains
 
 
@@ -214,7 +231,7 @@ def look_again(
     ``centres`` (N, 3), world, and ``radii`` (N,) are of the spheres that fit them, in metres. For the numbers in steps
     see :func:`headvox.keep.keep`.
     """
-    scores = scores + gains_of(images, centres, radii, relief)
+    scores = scores + gains_of(images, centres, radii, least - slack - scores, relief)
     kept = np.flatnonzero(keep(centres, scores, least, slack, expected, voxel_m))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     return kept, scores[kept]

@@ -98,7 +98,8 @@ def relief_lines(relief: Relief | None) -> list[str]:
         return []
     spots = [f"{spot.name} = [{spot.side:g}, {spot.up:g}]" for spot in relief.spots]
     trees = [f"  '{' '.join(_words(tree))}'," for tree in relief.trees]
-    return ["[relief]", f"most = {relief.most:g}", "trees = [", *trees, "]", "", "[relief.spots]", *spots, ""]
+    limits = [f"{name} = {getattr(relief, name):g}" for name in ("most", "first", "reach")]
+    return ["[relief]", *limits, "trees = [", *trees, "]", "", "[relief.spots]", *spots, ""]
 
 
 def _words(tree: Tree) -> Iterator[str]:

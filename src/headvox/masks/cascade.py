@@ -100,12 +100,14 @@ class Relief:
     """The last look at what may be a head, pixel by pixel: trees change the score, by ``most`` at most.
 
     A cut is in metres: how much farther than the candidate the surface is at a spot, on its nearer or farther side; or
-    it is of one of :data:`MEASURES`.
+    it is of one of :data:`MEASURES`. After the ``first`` trees a candidate is given up that lacks more than ``reach``.
     """
 
     most: float
     spots: tuple[Spot, ...]
     trees: tuple[Tree, ...]
+    first: int = 0
+    reach: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)

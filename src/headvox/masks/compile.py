@@ -112,6 +112,9 @@ class CompiledStages:
     """How many stages, from the first, do without the channels "empty" and "hidden"."""
 
 
+UNREACHED = 1e9  # a score that nothing lacks
+
+
 @dataclass(frozen=True, slots=True)
 class CompiledRelief:
     """The last look in millimetres. Feature 2 k is the near, 2 k + 1 the far side of spot k; then come the measures.
@@ -125,6 +128,9 @@ class CompiledRelief:
     root: I64
     deepest: int
     """How many steps the deepest tree takes; a leaf leads to itself."""
+    first: int
+    reach: int
+    """A candidate that lacks more than ``reach``, in steps, after the ``first`` trees is given up."""
     most: int
     """The score changes by no more than that, in steps."""
 
@@ -314,14 +320,11 @@ def _add_tree(
 
 
 def _compile_relief(relief: Relief) -> CompiledRelief:
-    index = {spot.name: k for k, spot in enumerate(relief.spots)}
+    sides = [f"{spot.name}.{side}" for spot in relief.spots for side in SIDES]
+    numbers = {name: k for k, name in enumerate((*sides, *MEASURES))}
 
     def asked(name: str, metres: float) -> tuple[int, int]:
-        cut = _floor(round(1000.0 * min(max(metres, -FARTHEST_M), FARTHEST_M), 6))
-        if name in MEASURES:
-            return len(SIDES) * len(index) + MEASURES.index(name), cut
-        spot, _, side = name.rpartition(".")
-        return len(SIDES) * index[spot] + SIDES.index(side), cut
+        return numbers[name], _floor(round(1000.0 * min(max(metres, -FARTHEST_M), FARTHEST_M), 6))
 
     nodes: list[int] = []
     roots = [_add_tree(tree, asked, nodes) for tree in relief.trees]
@@ -330,6 +333,8 @@ def _compile_relief(relief: Relief) -> CompiledRelief:
         np.array(nodes, dtype=np.int32),
         np.array([root for root, _ in roots], dtype=np.int64),
         max((depth for _, depth in roots), default=0),
+        relief.first,
+        math.floor(min(relief.reach, UNREACHED) * SCORE_UNIT),
         math.floor(relief.most * SCORE_UNIT),
     )
 

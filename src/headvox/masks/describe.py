@@ -191,6 +191,8 @@ def _relief(relief: Relief) -> str:
         f"The last look, in depth images: {len(relief.trees)} trees over {len(rows)} pairs of spots, which change the "
         f"score by {relief.most:g} at most"
     )
+    if math.isfinite(relief.reach):
+        heading += f";\nwhat lacks more than {relief.reach:g} after the first {relief.first} is given up"
     return f"{heading}\n{table(['spot', 'to either side (m)', 'up (m)', 'cuts'], rows + measures)}"
 
 

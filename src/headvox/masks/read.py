@@ -126,6 +126,8 @@ class _Reader:
         return value
 
     def number(self, value: object, where: str, low: float = -LARGEST, high: float = LARGEST) -> float:
+        if type(value) is float and low <= value <= high:  # as nearly always, of 100,000 and more
+            return value
         number = math.nan
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             with suppress(OverflowError):
@@ -285,7 +287,7 @@ class _Reader:
         return stage, at
 
     def relief(self, value: object) -> Relief:
-        table = self.table(value, "relief", {"most", "spots", "trees"})
+        table = self.table(value, "relief", {"most", "first", "reach", "spots", "trees"})
         spots = []
         named = table.get("spots")
         for name, place in named.items() if isinstance(named, dict) else ():
@@ -299,7 +301,13 @@ class _Reader:
         features = {f"{spot.name}.{side}" for spot in spots for side in SIDES} | set(MEASURES)
         trees = self.items(table.get("trees"), "relief.trees")
         most = self.number(table.get("most"), "relief.most", 0.0, 1000.0)
-        return Relief(most, tuple(spots), tuple(self.tree(tree, features, "relief.trees") for tree in trees))
+        return Relief(
+            most,
+            tuple(spots),
+            tuple(self.tree(tree, features, "relief.trees") for tree in trees),
+            self.whole(table.get("first", 0), "relief.first", 0, len(trees)),
+            self.number(table.get("reach", math.inf), "relief.reach", 0.0, math.inf),
+        )
 
     def verification(self, value: object) -> Verification:
         names = [entry.name for entry in fields(Verification)]

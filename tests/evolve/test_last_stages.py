@@ -75,13 +75,21 @@ def test_the_last_stage_needs_heads_and_others():
 @pytest.mark.usefixtures("on_easy_views")
 def test_the_last_look_is_fitted_to_spoilt_views_and_written(evolved):
     folder, found, _ = evolved
+    found = replace(found, relief=None, verification=None)
     said: list[str] = []
     more = search._with_last_look(search.Settings(folder, 200, "easy"), found, said.append)
     assert said[-1].startswith("looked again: ")
     blunt, sharp = (load_cascade(str(folder / name)) for name in ("blunt.toml", "sharp.toml"))
     assert blunt.relief is None
     assert sharp.judge == blunt.judge
+    kept = [stage.keep for stage in (*found.search, *found.judge)]
+    patient = [stage.keep for stage in (*more.search, *more.judge)]
+    waits = [stage > search.HASTY for stage in range(1, len(kept) + 1)]
+    assert patient == pytest.approx(np.array(kept) - np.where(waits, search.PATIENCE, 0.0))
+    assert any(waits)
     assert sharp.relief is not None
+    assert sharp.relief.first == last_look.FIRST
+    assert 0.0 <= sharp.relief.reach < last_look.MOST
     assert sharp.relief == more.relief
     assert 0 < len(sharp.relief.spots) <= last_look.MOST_SPOTS
     assert len(sharp.relief.trees) == last_look.TREES
@@ -94,7 +102,29 @@ def test_the_last_look_is_fitted_to_spoilt_views_and_written(evolved):
 
 def test_nothing_to_tell_apart_gives_no_last_look():
     features = 2 * len(last_look.SPOTS) + len(MEASURES)
-    same = last_look.Looks(np.zeros((9, features), np.int16), np.ones(9, np.int8), np.zeros(9))
+    same = last_look.Looks(
+        np.zeros((9, features), np.int16), np.ones(9, np.int8), np.zeros(9), np.zeros(9, bool)
+    )
     assert last_look.fit_relief(same, 0) is None
     different = replace(same, label=np.arange(9, dtype=np.int8) % 2)
     assert last_look.fit_relief(different, 0) is None  # of what is seen alike
+
+
+class Steps:
+    """A model whose first trees say what the first column holds, in tenths, and all of them what the second does."""
+
+    def predict(self, features, num_iteration, raw_score):
+        assert raw_score
+        return features[:, 0 if num_iteration == last_look.FIRST else 1] / 10.0
+
+
+def test_the_reach_is_what_nearly_every_head_lacks_after_the_first_trees():
+    relief = np.zeros((4, 3), np.int16)
+    relief[:, 1:] = [[-5, 10], [-12, 10], [-40, -20], [-99, 49]]  # the third is no head in the end either
+    heads = last_look.Looks(relief, np.ones(4, np.int8), np.array([0.0, 0.5, 0.0, 0.0]), np.ones(4, bool))
+    columns = np.array([1, 2])
+    assert last_look._reach(Steps(), columns, heads.of(np.arange(4) < 3)) == pytest.approx(0.7, abs=0.011)
+    assert last_look._reach(Steps(), columns, heads) == pytest.approx(
+        last_look.MOST, abs=0.02
+    )  # no tree says more
+    assert last_look._reach(Steps(), columns, heads.of(np.zeros(4, bool))) == np.inf

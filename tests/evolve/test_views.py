@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from headvox.data import DepthImage, Intrinsics
+import numpy as np
+import pytest
+
+from headvox.data import DepthImage, Frame, Intrinsics
 from headvox.evolve import views
-from headvox.evolve.spoil import spoil
+from headvox.evolve.spoil import cut_off, spoil
 from headvox.frames import inverse, transform
 from headvox.synth.scene import TrueHead
 
@@ -75,3 +78,55 @@ def test_a_spoilt_view_is_the_same_view_from_a_worse_sensor(real_view):
             np.testing.assert_allclose(now.T_world_camera[2, 3], was.T_world_camera[2, 3], atol=0.21)
     assert min(lost) == 0 < max(lost)
     assert 0.0 < min(tilted) < 0.07 < max(tilted) < 0.25  # radians
+
+
+def looking_level(centres: list[list[float]], visible: float = 0.8) -> views.View:
+    """Heads before a camera of 40 by 30 pixels, each pixel of another depth."""
+    camera = Intrinsics(40, 30, 40.0, 40.0, 19.5, 14.5, 0.001)
+    depth = np.arange(1, 1201, dtype=np.uint16).reshape(30, 40)
+    places, count = np.array(centres).reshape(-1, 3), len(centres)
+    heads = views.Heads(places, np.full(count, visible), np.ones(count, bool), np.zeros(count, np.int64))
+    return views.View(7, Frame(0, depths=(DepthImage("a", depth, camera, np.eye(4)),)), heads)
+
+
+@pytest.mark.parametrize(
+    ("centre", "side"), [([-0.3, 0, 1], 0), ([0.3, 0, 1], 1), ([0, -0.2, 1], 2), ([0, 0.2, 1], 3)]
+)
+def test_the_side_that_is_nearest_to_a_head_is_moved_as_far_as_it(centre, side):
+    whole = looking_level([centre])
+    (was,) = whole.frame.depths
+    shares = []
+    for seed in range(30):
+        cut = cut_off(whole, np.random.default_rng(seed))
+        (now,) = cut.frame.depths
+        left, top = was.intrinsics.cx - now.intrinsics.cx, was.intrinsics.cy - now.intrinsics.cy
+        lost = [left, 40 - now.intrinsics.width - left, top, 30 - now.intrinsics.height - top]
+        assert [k for k in range(4) if lost[k]] in ([side], [])
+        height, width = now.depth.shape
+        assert (width, height) == (now.intrinsics.width, now.intrinsics.height)
+        rows, columns = int(top) + np.arange(height), int(left) + np.arange(width)
+        np.testing.assert_array_equal(now.depth, was.depth[np.ix_(rows, columns)])
+        share = cut.heads.visible[0] / 0.8
+        assert cut.heads.clear[0] == (share == 1.0)
+        shares.append(share)
+    assert 0.1 < min(shares) < 0.5 < 0.9 < max(shares) <= 1.0
+
+
+def test_what_one_image_cuts_off_another_may_show():
+    one = looking_level([[0.3, 0.0, 1.0]])
+    (left,) = one.frame.depths
+    moved = np.eye(4)
+    moved[0, 3] = 0.3  # another camera, which has the head in its middle, and so another side to move
+    both = replace(one, frame=Frame(0, depths=(left, replace(left, name="b", T_world_camera=moved))))
+    cut = cut_off(both, np.random.default_rng(0))
+    alone = cut_off(one, np.random.default_rng(0))
+    assert alone.heads.visible[0] <= cut.heads.visible[0] <= 0.8
+
+
+def test_a_view_of_nobody_is_cut_anywhere():
+    cuts = {
+        cut_off(looking_level([]), np.random.default_rng(k)).frame.depths[0].depth.shape for k in range(30)
+    }
+    assert len(cuts) > 10
+    assert all(height == 30 or width == 40 for height, width in cuts)
+    assert min(height * width for height, width in cuts) >= 0.6 * 1200

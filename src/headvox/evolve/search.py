@@ -46,6 +46,8 @@ GATE_LOSES, TIGHT_GATE_LOSES = 0.03, 0.004
 SEARCH_ROUNDS = 2
 PRUNED = 0.004
 JUDGE_MISSES = 0.10  # of the heads that the search leaves: what the stages before need not keep
+PATIENCE = 1.0  # by which stages keep more, once the last look can tell what they cannot
+HASTY = 2  # stages that do not, from the first: what these let through costs most
 MINED = -4.0  # score of the judge from which a voxel that is no head is worth another look
 FALSE_A_FRAME = 0.02
 WORTH_A_ROUND = 0.002  # of recall
@@ -137,6 +139,8 @@ def _with_second_opinion(settings: Settings, found: Found, say: Say) -> Found:
 
 def _with_last_look(settings: Settings, found: Found, say: Say) -> Found:
     """Return ``found`` with the relief's trees, and its thresholds set anew."""
+    hasty, patient = found.search[:HASTY], found.search[HASTY:]
+    found = replace(found, search=[*hasty, *_patient(patient)], judge=_patient(found.judge))
     path = settings.work / "blunt.toml"
     write_cascade(path, settings.name, found)
     parts = [part for part in _of_views(settings, partial(spoilt_looks, cascade=path)) if part is not None]
@@ -149,6 +153,10 @@ def _with_last_look(settings: Settings, found: Found, say: Say) -> Found:
     found, recall = _with_thresholds(settings, path, found)
     say(f"looked again: {100 * recall:.1f} % of the heads kept aside at {FALSE_A_FRAME:g} false a frame")
     return found
+
+
+def _patient(stages: Sequence[boost.Fitted]) -> list[boost.Fitted]:
+    return [replace(stage, keep=stage.keep - PATIENCE) for stage in stages]
 
 
 def _with_verification(settings: Settings, found: Found, say: Say) -> Found:

@@ -280,4 +280,4 @@ def test_a_tree_in_words_is_the_same_tree():
 
 def test_the_last_look_is_described():
     told = describe_cascade(load_cascade("default"))
-    assert "The last look, in depth images: 400 trees over 72 pairs of spots" in told
+    assert "The last look, in depth images: 800 trees over 110 pairs of spots" in told

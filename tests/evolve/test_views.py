@@ -21,6 +21,8 @@ def test_a_view_is_kept_on_disk_and_is_the_same_when_it_is_made_again(tmp_path, 
         assert view.number == 9
         for name in ("centres", "visible", "clear", "posture"):
             np.testing.assert_array_equal(getattr(view.heads, name), getattr(real_view.heads, name))
+        assert view.heads.hair == real_view.heads.hair
+        assert len(view.heads.hair) == len(view.heads.centres) > 0
         assert len(view.frame.depths) == len(real_view.frame.depths) > 0
         for mine, made in zip(view.frame.depths, real_view.frame.depths, strict=True):
             np.testing.assert_array_equal(mine.depth, made.depth)

@@ -75,7 +75,7 @@ def look_at(views: Iterable[View], detector: Detector, as_clouds: bool = False) 
     false: list[F64] = []
     frames = 0
     for view in views:
-        frame = _points_of(view.frame) if as_clouds else view.frame
+        frame = points_of(view.frame) if as_clouds else view.frame
         try:
             found = detector.detect_frame(frame)
         except HeadvoxError:  # nothing in range
@@ -91,7 +91,8 @@ def look_at(views: Iterable[View], detector: Detector, as_clouds: bool = False) 
     return Outcome(np.concatenate([*heads, np.empty(0)]), np.concatenate([*false, np.empty(0)]), frames)
 
 
-def _points_of(frame: Frame) -> Frame:
+def points_of(frame: Frame) -> Frame:
+    """Return the points of the depth images as clouds without any known origin."""
     clouds = [
         Cloud(
             image.name,

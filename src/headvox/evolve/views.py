@@ -42,13 +42,15 @@ class Heads:
     """The heads of a view.
 
     ``centres`` (N, 3) m; ``visible`` (N,) the share that the sensor which sees it best sees; ``clear`` (N,) whether
-    a detector should find it: a quarter visible, whole, and nobody's dummy; ``posture`` (N,) index into POSTURES.
+    a detector should find it: a quarter visible, whole, and nobody's dummy; ``posture`` (N,) index into POSTURES;
+    ``hair`` what is on each head, of depth images only; empty where it was not noted.
     """
 
     centres: F64
     visible: F64
     clear: npt.NDArray[np.bool_]
     posture: npt.NDArray[np.int64]
+    hair: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,8 @@ def _heads_of(truth: Sequence[TrueHead], images: Sequence[DepthImage], far_m: di
     ]
     posture = [POSTURES.index(head.posture) if head.posture in POSTURES else len(POSTURES) for head in truth]
     centres = np.array([head.centre for head in truth]).reshape(-1, 3)
-    return Heads(centres, visible, np.array(clear, bool), np.array(posture, np.int64))
+    hair = tuple(head.hair for head in truth)
+    return Heads(centres, visible, np.array(clear, bool), np.array(posture, np.int64), hair)
 
 
 def _misplaced(image: DepthImage, rng: Rng) -> DepthImage:
@@ -171,7 +174,7 @@ def keep_view(folder: Path, seed: int, number: int) -> View:
 def _write(path: Path, view: View) -> None:
     arrays: dict[str, npt.NDArray[Any]] = {
         "centres": view.heads.centres, "visible": view.heads.visible, "clear": view.heads.clear,
-        "posture": view.heads.posture,
+        "posture": view.heads.posture, "hair": np.array(view.heads.hair, np.str_),
     }  # fmt: skip
     for k, image in enumerate(view.frame.depths):
         c = image.intrinsics
@@ -189,7 +192,8 @@ def _write(path: Path, view: View) -> None:
 
 def _read(path: Path, number: int) -> View:
     with np.load(path, allow_pickle=False) as arrays:
-        heads = Heads(arrays["centres"], arrays["visible"], arrays["clear"], arrays["posture"])
+        hair = tuple(arrays["hair"].tolist()) if "hair" in arrays.files else ()
+        heads = Heads(arrays["centres"], arrays["visible"], arrays["clear"], arrays["posture"], hair)
         depths, clouds = [], []
         for k in range(len(arrays.files)):
             if f"depth_{k}" in arrays.files:

@@ -1,0 +1,193 @@
+"""What does a cascade find in rendered views that nothing was chosen on, and of which heads?
+
+    python bench/unseen.py FOLDER --seed 79 [--views 1500] [--cascade default] [--refine pose] [--clouds]
+
+Looks at the depth images among the first views of a seed, and prints markdown tables: which share of the heads is found
+at so many false heads a frame; then, with the cascade's own threshold, by what is known of each head.
+FOLDER keeps the views, which take a quarter of a second each to make. A seed is unseen once: whoever changes a cascade
+after reading its tables takes another.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from headvox.config import DetectorConfig
+from headvox.data import F64
+from headvox.errors import HeadvoxError
+from headvox.evaluate.match import Rules, match
+from headvox.evolve.check import LEAST_SCORE, MISSED, points_of
+from headvox.evolve.samples import RANGE_M, to_find
+from headvox.evolve.views import KINDS, View, keep_view
+from headvox.frames import inverse, transform
+from headvox.masks.read import load_cascade
+from headvox.pipeline import Detector
+from headvox.synth.scene import POSTURES
+
+RATES = (0.01, 0.02, 0.05, 0.1, 0.2)  # false heads a frame
+ORDINARY_POSTURES = ("standing", "walking", "sitting")
+CLEAR_SHARE, CLEAR_M = 0.3, 4.0
+RANGES_M, SHARES = (0.0, 1.0, 2.0, 3.0, 4.0, RANGE_M), (0.2, 0.4, 0.6, 0.8, 1.0)
+FEWEST = 10  # heads, of which a share is told
+
+
+@dataclass(frozen=True)
+class Head:
+    """A head to find: how much it scored, and what is known of it."""
+
+    score: float
+    posture: str
+    hair: str
+    visible: float
+    range_m: float
+    kind: str
+    cameras: int
+    image: str
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a detector said of all views: the heads, what the false ones scored, and of those where nobody was."""
+
+    heads: list[Head]
+    false: F64
+    false_of_nobody: F64
+    frames: int
+    of_nobody: int
+
+    def threshold(self, rate: float) -> float:
+        """Return the score that leaves ``rate`` false heads a frame at most."""
+        worst = np.sort(self.false)[::-1]
+        allowed = int(rate * self.frames)
+        return float(np.nextafter(worst[allowed], np.inf)) if len(worst) > allowed else LEAST_SCORE
+
+
+def look(folder: Path, seed: int, views: int, detector: Detector, as_clouds: bool) -> Seen:
+    """Run ``detector`` over the depth images among the first ``views`` of ``seed``."""
+    heads: list[Head] = []
+    false: dict[bool, list[F64]] = {True: [np.empty(0)], False: [np.empty(0)]}
+    for number in range(views):
+        if KINDS[number % len(KINDS)] in ("bodies", "shell"):
+            continue  # clouds
+        view = keep_view(folder, seed, number)
+        try:
+            found = detector.detect_frame(points_of(view.frame) if as_clouds else view.frame)
+        except HeadvoxError:  # nothing in range
+            continue
+        wanted = to_find(view)
+        pairing = match(found.centres, view.heads.centres, wanted, Rules(clear_m=0.25))
+        scores = np.full(len(wanted), MISSED)
+        scores[pairing.pairs[:, 1]] = found.scores[pairing.pairs[:, 0]]
+        heads += [_head(view, k, float(scores[k])) for k in np.flatnonzero(wanted).tolist()]
+        false[view.kind == "nobody"].append(found.scores[pairing.false])
+    nobody, others = np.concatenate(false[True]), np.concatenate(false[False])
+    frames = len(false[True]) + len(false[False]) - 2
+    return Seen(heads, np.concatenate([nobody, others]), nobody, frames, len(false[True]) - 1)
+
+
+def _head(view: View, k: int, score: float) -> Head:
+    heads, images = view.heads, view.frame.depths
+    eyes = [transform(inverse(image.T_world_camera), heads.centres[k : k + 1]) for image in images]
+    lens = images[0].intrinsics
+    return Head(
+        score,
+        POSTURES[heads.posture[k]],
+        heads.hair[k] if heads.hair else "not noted",
+        float(heads.visible[k]),
+        min(float(np.linalg.norm(eye)) for eye in eyes),
+        view.kind,
+        len(images),
+        f"{lens.width}x{lens.height}",
+    )
+
+
+def tables(seen: Seen, least: float) -> Iterator[str]:
+    """Yield all that is printed, line by line; ``least`` is the cascade's own threshold."""
+    yield f"{seen.frames} frames, {len(seen.heads)} heads; with {least:g}: {_a_frame(seen, least):.3f} false a frame,"
+    yield f"{int((seen.false_of_nobody >= least).sum())} in the {seen.of_nobody} with nobody"
+    yield ""
+    yield _row("", *(f"{rate:g} false" for rate in RATES), f"{least:g}")
+    yield _row(*["---"] * (len(RATES) + 2))
+    for name, chosen in GROUPS.items():
+        scores = np.array([head.score for head in seen.heads if chosen(head)])
+        shares = [_share(scores, seen.threshold(rate)) for rate in RATES]
+        yield _row(f"{name} ({len(scores)})", *shares, _share(scores, least))
+    for names in (
+        [head.posture for head in seen.heads],
+        [_between(head.range_m, RANGES_M, " m") for head in seen.heads],
+        [_between(head.visible, SHARES, " seen") for head in seen.heads],
+        [f"{head.cameras} cameras" if head.cameras > 1 else "1 camera" for head in seen.heads],
+        [head.image for head in seen.heads],
+        [head.hair for head in seen.heads],
+    ):
+        yield ""
+        yield from _by(names, seen, least)
+
+
+def _is_clear(head: Head) -> bool:
+    return head.visible >= CLEAR_SHARE and head.range_m <= CLEAR_M
+
+
+GROUPS: dict[str, Callable[[Head], bool]] = {
+    "all heads": lambda head: True,
+    "clear": _is_clear,
+    "upright": lambda head: _is_clear(head) and head.posture in ORDINARY_POSTURES,
+    "ordinary rooms": lambda head: _is_clear(head) and head.kind == "ordinary",
+}
+
+
+def _by(names: list[str], seen: Seen, least: float) -> Iterator[str]:
+    """Yield a table with a column for each of ``names``, one a head."""
+    scores, of = np.array([head.score for head in seen.heads]), np.array(names)
+    columns = [name for name in sorted(set(names)) if (of == name).sum() >= FEWEST]
+    yield _row(*(f"{name} ({int((of == name).sum())})" for name in columns))
+    yield _row(*["---"] * len(columns))
+    yield _row(*(_share(scores[of == name], least) for name in columns))
+
+
+def _between(value: float, borders: tuple[float, ...], unit: str) -> str:
+    k = int(np.clip(np.searchsorted(borders, value, "right") - 1, 0, len(borders) - 2))
+    return f"{borders[k]:g}-{borders[k + 1]:g}{unit}"
+
+
+def _a_frame(seen: Seen, least: float) -> float:
+    return float((seen.false >= least).sum()) / max(seen.frames, 1)
+
+
+def _share(scores: F64, least: float) -> str:
+    return f"{100.0 * float((scores >= least).mean()):.1f} %" if len(scores) else ""
+
+
+def _row(*columns: str) -> str:
+    return f"| {' | '.join(columns)} |"
+
+
+def main() -> None:
+    """Look, and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--views", type=int, default=1500)
+    parser.add_argument("--cascade", default="default")
+    parser.add_argument("--refine", default="pose", choices=("pose", "sphere"))
+    parser.add_argument(
+        "--clouds", action="store_true", help="points instead of images: nothing is known empty"
+    )
+    args = parser.parse_args()
+    config = DetectorConfig(cascade=args.cascade, max_range_m=RANGE_M, refine=args.refine)
+    cascade = load_cascade(args.cascade)
+    least = cascade.min_score_occupied if args.clouds else cascade.min_score
+    detector = Detector(replace(config, min_score=LEAST_SCORE))
+    for line in tables(look(args.folder, args.seed, args.views, detector, args.clouds), least):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

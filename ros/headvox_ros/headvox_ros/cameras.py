@@ -8,6 +8,7 @@ are known, go out on ``/true_heads``.
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseArray, Quaternion, TransformStamped, Vector3
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
@@ -31,6 +33,7 @@ from headvox_ros.cloud_concatenate import as_message_data, cloud_message
 from headvox_ros.sensors import RELIABILITIES
 
 WORLD = "world"
+FINISH_S = 5.0  # a listener that takes longer has gone, or hangs
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +100,14 @@ class Cameras:
                 camera.points.publish(cloud_message(header, organised_points(image)))
         if heads is not None:
             self._truth.publish(PoseArray(header=Header(stamp=stamp, frame_id=WORLD), poses=heads))
+
+    def finish(self) -> None:
+        """Wait until whoever listens reliably has what was sent: what has not left when the process ends is lost."""
+        until = time.monotonic() + FINISH_S
+        for camera in self._cameras.values():
+            for publisher in (camera.info, camera.depth, camera.points):
+                if publisher is not None:
+                    publisher.wait_for_all_acked(Duration(seconds=max(0.0, until - time.monotonic())))
 
 
 def fixed(node: Node, name: str, default: Any, description: str) -> Any:

@@ -68,6 +68,7 @@ class Player(Node):
             now_s = 1e-9 * since_ns
             missing = {name for name, begin, end in gone if begin <= now_s < end}
             self.publish(frame, start_ns + again_ns, missing)
+        self._cameras.finish()
         print(f"done, {skipped} frames skipped", flush=True)
 
     def _schedule(self) -> Iterator[tuple[Frame, int]]:

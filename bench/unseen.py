@@ -19,9 +19,7 @@ import numpy as np
 
 from headvox.config import DetectorConfig
 from headvox.data import F64
-from headvox.errors import HeadvoxError
-from headvox.evaluate.match import Rules, match
-from headvox.evolve.check import LEAST_SCORE, MISSED, points_of
+from headvox.evolve.check import LEAST_SCORE, Outcome, scores_in
 from headvox.evolve.samples import RANGE_M, to_find
 from headvox.evolve.views import KINDS, View, keep_view
 from headvox.frames import inverse, transform
@@ -52,42 +50,35 @@ class Head:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a detector said of all views: the heads, what the false ones scored, and of those where nobody was."""
+    """What a detector said of all views, and of those with nobody in them."""
 
     heads: list[Head]
-    false: F64
-    false_of_nobody: F64
-    frames: int
-    of_nobody: int
-
-    def threshold(self, rate: float) -> float:
-        """Return the score that leaves ``rate`` false heads a frame at most."""
-        worst = np.sort(self.false)[::-1]
-        allowed = int(rate * self.frames)
-        return float(np.nextafter(worst[allowed], np.inf)) if len(worst) > allowed else LEAST_SCORE
+    all: Outcome
+    nobody: Outcome
 
 
 def look(folder: Path, seed: int, views: int, detector: Detector, as_clouds: bool) -> Seen:
     """Run ``detector`` over the depth images among the first ``views`` of ``seed``."""
     heads: list[Head] = []
-    false: dict[bool, list[F64]] = {True: [np.empty(0)], False: [np.empty(0)]}
+    false: list[F64] = []
+    of_nobody: list[F64] = []
     for number in range(views):
         if KINDS[number % len(KINDS)] in ("bodies", "shell"):
             continue  # clouds
         view = keep_view(folder, seed, number)
-        try:
-            found = detector.detect_frame(points_of(view.frame) if as_clouds else view.frame)
-        except HeadvoxError:  # nothing in range
+        scores = scores_in(view, detector, as_clouds)
+        if scores is None:
             continue
-        wanted = to_find(view)
-        pairing = match(found.centres, view.heads.centres, wanted, Rules(clear_m=0.25))
-        scores = np.full(len(wanted), MISSED)
-        scores[pairing.pairs[:, 1]] = found.scores[pairing.pairs[:, 0]]
-        heads += [_head(view, k, float(scores[k])) for k in np.flatnonzero(wanted).tolist()]
-        false[view.kind == "nobody"].append(found.scores[pairing.false])
-    nobody, others = np.concatenate(false[True]), np.concatenate(false[False])
-    frames = len(false[True]) + len(false[False]) - 2
-    return Seen(heads, np.concatenate([nobody, others]), nobody, frames, len(false[True]) - 1)
+        wanted = np.flatnonzero(to_find(view)).tolist()
+        heads += [_head(view, k, float(score)) for k, score in zip(wanted, scores[0], strict=True)]
+        false.append(scores[1])
+        if view.kind == "nobody":
+            of_nobody.append(scores[1])
+    return Seen(heads, _outcome([head.score for head in heads], false), _outcome([], of_nobody))
+
+
+def _outcome(heads: list[float], false: list[F64]) -> Outcome:
+    return Outcome(np.array(heads), np.concatenate([*false, np.empty(0)]), len(false))
 
 
 def _head(view: View, k: int, score: float) -> Head:
@@ -108,14 +99,16 @@ def _head(view: View, k: int, score: float) -> Head:
 
 def tables(seen: Seen, least: float) -> Iterator[str]:
     """Yield all that is printed, line by line; ``least`` is the cascade's own threshold."""
-    yield f"{seen.frames} frames, {len(seen.heads)} heads; with {least:g}: {_a_frame(seen, least):.3f} false a frame,"
-    yield f"{int((seen.false_of_nobody >= least).sum())} in the {seen.of_nobody} with nobody"
+    false, of_nobody = (int((outcome.false >= least).sum()) for outcome in (seen.all, seen.nobody))
+    rate = false / max(seen.all.frames, 1)
+    yield f"{seen.all.frames} frames, {len(seen.heads)} heads; with {least:g}: {rate:.3f} false a frame,"
+    yield f"{of_nobody} in the {seen.nobody.frames} with nobody"
     yield ""
     yield _row("", *(f"{rate:g} false" for rate in RATES), f"{least:g}")
     yield _row(*["---"] * (len(RATES) + 2))
     for name, chosen in GROUPS.items():
         scores = np.array([head.score for head in seen.heads if chosen(head)])
-        shares = [_share(scores, seen.threshold(rate)) for rate in RATES]
+        shares = [_share(scores, seen.all.threshold(rate)) for rate in RATES]
         yield _row(f"{name} ({len(scores)})", *shares, _share(scores, least))
     for names in (
         [head.posture for head in seen.heads],
@@ -153,10 +146,6 @@ def _by(names: list[str], seen: Seen, least: float) -> Iterator[str]:
 def _between(value: float, borders: tuple[float, ...], unit: str) -> str:
     k = int(np.clip(np.searchsorted(borders, value, "right") - 1, 0, len(borders) - 2))
     return f"{borders[k]:g}-{borders[k + 1]:g}{unit}"
-
-
-def _a_frame(seen: Seen, least: float) -> float:
-    return float((seen.false >= least).sum()) / max(seen.frames, 1)
 
 
 def _share(scores: F64, least: float) -> str:

@@ -111,7 +111,7 @@ def test_the_cache_is_a_folder() -> None:
 def test_another_process_compiles_the_pose_fit_where_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     begun = []
 
-    class Noted(subprocess.Popen):  # type: ignore[type-arg]
+    class Noted(subprocess.Popen):
         def __init__(self, command: list[str], **settings: int) -> None:
             begun.append(self)
             super().__init__(command, **settings)

@@ -75,24 +75,33 @@ def look_at(views: Iterable[View], detector: Detector, as_clouds: bool = False) 
     false: list[F64] = []
     frames = 0
     for view in views:
-        frame = points_of(view.frame) if as_clouds else view.frame
-        try:
-            found = detector.detect_frame(frame)
-        except HeadvoxError:  # nothing in range
+        scores = scores_in(view, detector, as_clouds)
+        if scores is None:
             continue
         frames += 1
-        counted = to_find(view)
-        pairing = match(found.centres, view.heads.centres, counted, Rules(clear_m=0.25))
-        scores = np.full(int(counted.sum()), MISSED)
-        real = np.flatnonzero(counted)
-        scores[np.searchsorted(real, pairing.pairs[:, 1])] = found.scores[pairing.pairs[:, 0]]
-        heads.append(scores)
-        false.append(found.scores[pairing.false])
+        heads.append(scores[0])
+        false.append(scores[1])
     return Outcome(np.concatenate([*heads, np.empty(0)]), np.concatenate([*false, np.empty(0)]), frames)
 
 
-def points_of(frame: Frame) -> Frame:
-    """Return the points of the depth images as clouds without any known origin."""
+def scores_in(view: View, detector: Detector, as_clouds: bool = False) -> tuple[F64, F64] | None:
+    """Return the scores of the heads to find in ``view``, -inf of a missed one, and of false heads.
+
+    They are (N,), in the order of the heads, and (M,); None: nothing is in range.
+    """
+    try:
+        found = detector.detect_frame(_points_of(view.frame) if as_clouds else view.frame)
+    except HeadvoxError:
+        return None
+    counted = to_find(view)
+    pairing = match(found.centres, view.heads.centres, counted, Rules(clear_m=0.25))
+    scores = np.full(int(counted.sum()), MISSED)
+    real = np.flatnonzero(counted)
+    scores[np.searchsorted(real, pairing.pairs[:, 1])] = found.scores[pairing.pairs[:, 0]]
+    return scores, found.scores[pairing.false]
+
+
+def _points_of(frame: Frame) -> Frame:
     clouds = [
         Cloud(
             image.name,

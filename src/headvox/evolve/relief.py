@@ -139,9 +139,9 @@ def _reach(model: Any, columns: npt.NDArray[np.int64], heads: Looks) -> float:
         return np.asarray(heads.score + np.clip(gains, -MOST, MOST))
 
     found = scores(FIRST)[scores(None) >= 0.0]
-    return (
-        max(0.0, math.ceil(-100.0 * float(np.quantile(found, GIVEN_UP))) / 100.0) if len(found) else math.inf
-    )
+    if not len(found):
+        return math.inf
+    return max(0.0, math.ceil(-100.0 * float(np.quantile(found, GIVEN_UP))) / 100.0)
 
 
 def _tree(node: dict[str, Any], columns: npt.NDArray[np.int64]) -> Tree:

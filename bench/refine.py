@@ -23,8 +23,8 @@ from headvox.data import Cloud, Expected, Frame
 from headvox.errors import HeadvoxError
 from headvox.machine.threads import Threads
 from headvox.parallel.workers import Workers
-from headvox.pose.align import EVIDENCE
 from headvox.pose.fit import FitMemory, fit_poses
+from headvox.pose.residuals import EVIDENCE
 from headvox.pose.trials import TRIED, Trials
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait

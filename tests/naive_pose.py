@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from headvox.data import Frame
-from headvox.pose import align, nearby, trials
+from headvox.pose import align, nearby, residuals, trials
 from headvox.pose import settle as settling
 from headvox.pose import template as template_of
 
@@ -52,13 +52,13 @@ def even(count, most):
     return [(2 * s + 1) * count // (2 * used) for s in range(used)]
 
 
-def residuals(state, points, modes, template):
+def distances(state, points, modes, template):
     """Distance, gradient, place in the head, sigma and modes of the points on the grid, and which those are."""
     R, scale = state[3:12].reshape(3, 3), np.exp(state[12])
     q = (points - state[:3]) @ R / scale
     cell = np.floor((q - template.low) / template.voxel_m).astype(int)
-    inside = ((cell >= 0) & (cell < template.rows.shape[:3])).all(axis=1)
-    row = template.rows[tuple(cell[inside].T)].astype(np.float64)
+    inside = ((cell >= 0) & (cell < template.shape)).all(axis=1)
+    row = template.rows.reshape(*template.shape, -1)[tuple(cell[inside].T)].astype(np.float64)
     q = q[inside]
     middle = template.low + (cell[inside] + 0.5) * template.voxel_m
     shape = row[:, 5 : 5 + modes]
@@ -76,30 +76,30 @@ def linearise(samples, rays, most, modes, k, upright, template, state):
     passing = rays[even(len(rays), most[1])]
     near = passing[:, :3] - state[:3]
     near = near - (near * passing[:, 3:]).sum(axis=1, keepdims=True) * passing[:, 3:] + state[:3]
-    each = min(1.0, align.INDEPENDENT / len(chosen))
+    each = min(1.0, residuals.INDEPENDENT / len(chosen))
     for points, kind in ((chosen[:, :3], "point"), (near, "ray")):
-        value, g, q, sigma, shape, inside = residuals(state, points, modes, template)
+        value, g, q, sigma, shape, inside = distances(state, points, modes, template)
         e, variance = scale * value, (scale * sigma) ** 2
         J = np.hstack([-g, scale * np.cross(g, q), scale * (value - (g * q).sum(1))[:, None], scale * shape])
         if kind == "point":
             s = chosen[inside]
             variance = variance + (s[:, 6] * (g * (s[:, 3:6] @ R)).sum(axis=1)) ** 2 + s[:, 7] ** 2
             weight = np.full(len(e), each)
-            turned = np.maximum((g * (s[:, 3:6] @ R)).sum(axis=1) - align.FACING_AWAY, 0.0)
-            hidden = (align.BREADTH_M * turned) ** 2 / (align.CHORD_SIGMA_M**2 + s[:, 6] ** 2)
+            turned = np.maximum((g * (s[:, 3:6] @ R)).sum(axis=1) - residuals.FACING_AWAY, 0.0)
+            hidden = (residuals.BREADTH_M * turned) ** 2 / (residuals.CHORD_SIGMA_M**2 + s[:, 6] ** 2)
         else:
             hidden = np.zeros(len(e))
-            weight = np.where(e < 0, align.RAY_WEIGHT, 0.0)
-            told[align.CROSSED] = np.sum(e < 0)
+            weight = np.where(e < 0, residuals.RAY_WEIGHT, 0.0)
+            told[residuals.CROSSED] = np.sum(e < 0)
         bare = e**2 / variance
         damp = 1 / (1 + bare / k**2)
         cost += np.sum(weight * (bare + hidden) / (1 + (bare + hidden) / k**2))
         if kind == "point":
             outside = k * k * np.sum(~inside)
             cost += each * outside
-            told[align.COST] = ((bare * damp).sum() + outside) / 2
-            told[align.ON_SURFACE] = np.sum(bare < k**2)
-        w = np.where(damp < align.LEAST_DAMPING, 0.0, weight * damp**2 / variance)
+            told[residuals.COST] = ((bare * damp).sum() + outside) / 2
+            told[residuals.ON_SURFACE] = np.sum(bare < k**2)
+        w = np.where(damp < residuals.LEAST_DAMPING, 0.0, weight * damp**2 / variance)
         A += (J * w[:, None]).T @ J
         b += (J * w[:, None]).T @ e
     priors = [
@@ -137,7 +137,7 @@ def move(state, step):
 def refine_one(samples, rays, turn, upright, template):
     """What a single start comes to: state, told."""
     modes = template_of.FINE_MODES
-    state = np.zeros(align.STATE)
+    state = np.zeros(residuals.STATE)
     state[3:12] = turn
     most = (trials.FINE_SAMPLES, trials.FINE_RAYS)
     for k in np.linspace(trials.FINE_K, trials.LAST_K, trials.FINE_STEPS):
@@ -151,9 +151,9 @@ def polish_one(samples, rays, state, upright, template):
     """What the last steps make of it: state, told but for the evidence, covariance of shift and turn."""
     most = (trials.POLISH_SAMPLES, trials.POLISH_RAYS)
     for _ in range(trials.POLISH_STEPS):
-        _, A, b, _ = linearise(samples, rays, most, align.MODES, trials.LAST_K, upright, template, state)
+        _, A, b, _ = linearise(samples, rays, most, residuals.MODES, trials.LAST_K, upright, template, state)
         state = move(state, -np.linalg.solve(A, b))
-    _, A, _, told = linearise(samples, rays, most, align.MODES, trials.LAST_K, upright, template, state)
+    _, A, _, told = linearise(samples, rays, most, residuals.MODES, trials.LAST_K, upright, template, state)
     return state, told, np.linalg.inv(A)[:6, :6]
 
 
@@ -165,7 +165,7 @@ def recentre(centre, state, template):
 
 def settle(work, count, best, centre, template):
     """What is stated of a mixture of states: centre, radius, its covariance, quaternion and its covariance."""
-    states, evidence = work.states[:count], work.told[:count, align.EVIDENCE]
+    states, evidence = work.states[:count], work.told[:count, residuals.EVIDENCE]
     R = states[best, 3:12].reshape(3, 3)
     odds = np.nan_to_num(np.exp((evidence[best] - evidence) / template.temperature))
     odds /= odds.sum()

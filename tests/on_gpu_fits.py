@@ -32,8 +32,9 @@ from headvox.cuda import (
 from headvox.cuda.device import is_simulated
 from headvox.cuda.fits import Fits
 from headvox.data import Expected
+from headvox.machine.cholesky import half_log_determinant
 from headvox.machine.threads import Threads
-from headvox.pose import align, trials
+from headvox.pose import align, residuals, trials
 from headvox.pose import fit as pose_on_cpu
 from headvox.pose import nearby as nearby_on_cpu
 from headvox.pose.fit import Poses
@@ -196,9 +197,9 @@ def test_the_same_is_gathered(kind, few):
     np.testing.assert_allclose(fits.samples.copy_to_host()[0, :n], samples[:n], atol=1e-12)
     np.testing.assert_allclose(fits.rays.copy_to_host()[0, :m], rays[:m], atol=1e-12)
     assert (n > 20 or few) if kind != "nothing near" else n == 0
-    points, used = np.zeros((trials.FINE_SAMPLES, 8)), min(n, trials.FINE_SAMPLES)
+    points, used = np.zeros((8, trials.FINE_SAMPLES)), min(n, trials.FINE_SAMPLES)
     assert choose_on_cpu(samples, n, points, trials.FINE_SAMPLES) == used
-    np.testing.assert_allclose(fits.points.copy_to_host()[0, :used], points[:used], atol=1e-12)
+    np.testing.assert_allclose(fits.points.copy_to_host()[0, :, :used], points[:, :used], atol=1e-12)
     assert near[nearby.ROUND] == trials.is_round(samples, n)
 
 
@@ -222,22 +223,22 @@ def factor_and_solve(A, size, x, told):
         told[0] = pose.solve_back(A, size, x)
 
 
-@pytest.mark.parametrize("size", [align.PARAMETERS, 10])
+@pytest.mark.parametrize("size", [residuals.PARAMETERS, 10])
 def test_the_same_step_is_taken(size):
     rng = np.random.default_rng(size)
     B = rng.normal(size=(size, 40))
-    A = np.zeros((pose.SYSTEM, pose.SYSTEM))
+    A = np.zeros((residuals.PARAMETERS, pose.SYSTEM))
     A[:size, :size] = np.triu(B @ B.T)
-    A[:size, align.RESIDUAL] = rng.normal(size=size)
-    x, wanted = np.zeros(align.PARAMETERS), np.zeros(align.PARAMETERS)
+    A[:size, residuals.RESIDUAL] = rng.normal(size=size)
+    x, wanted = np.zeros(residuals.PARAMETERS), np.zeros(residuals.PARAMETERS)
     on_device, x, told = to_device(A, x, np.zeros(1))
     factor_and_solve[1, 3](on_device, size, x, told)
-    system = A[: align.PARAMETERS].copy()
-    half_log_det = align.solve(system, wanted, size)
+    system = A.copy()
+    align.solve(system, wanted, size)
     np.testing.assert_allclose(x.copy_to_host(), wanted, rtol=1e-9)
-    np.testing.assert_allclose(told.copy_to_host()[0], half_log_det, rtol=1e-12)
+    np.testing.assert_allclose(told.copy_to_host()[0], half_log_determinant(system, size), rtol=1e-12)
     np.testing.assert_allclose(
-        np.tril(on_device.copy_to_host()[:size, :size], -1), np.tril(system[:size, :size], -1), rtol=1e-9
+        np.triu(on_device.copy_to_host()[:size, :size]), np.triu(system[:size, :size]), rtol=1e-9
     )
 
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from headvox import Cloud, DepthImage, Frame, Intrinsics
 from headvox.data import Expected
 from headvox.machine.threads import Threads
-from headvox.pose import align, nearby, settle, trials
+from headvox.pose import align, nearby, residuals, settle, trials
 from headvox.pose.fit import FitMemory, Poses, all_turns, expected_turns, fit_poses, upright_turns
 from headvox.pose.template import load_template
 from headvox.pose.trials import Scratch
@@ -104,53 +104,80 @@ def test_gathering_misses_nothing_however_far_the_sensor(distance, knows):
 
 
 def random_state(rng):
-    state = np.zeros(align.STATE)
+    state = np.zeros(residuals.STATE)
     state[:3] = rng.normal(0, 0.02, 3)
     state[3:12] = Rotation.from_rotvec(rng.normal(0, 0.7, 3)).as_matrix().reshape(9)
     state[12] = rng.normal(0, 0.05)
-    state[13:] = rng.normal(0, 0.7, align.MODES)
+    state[13:] = rng.normal(0, 0.7, residuals.MODES)
     return state
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("modes", [trials.COARSE_MODES, align.MODES])
+@pytest.mark.parametrize("modes", [trials.COARSE_MODES, residuals.MODES])
 def test_normal_equations_equal_the_naive_twin(seed, modes):
     rng = np.random.default_rng(seed)
     samples, rays = gathered(Frame(0, depths=(bumpy_image(rng),)), np.zeros(3))
     state, upright = random_state(rng), seed % 2 == 0
-    points, passing = samples[naive_pose.even(len(samples), 150)], rays[naive_pose.even(len(rays), 90)]
-    work, told = Scratch.new(), np.zeros(align.TOLD)
+    points = np.ascontiguousarray(samples[naive_pose.even(len(samples), 150)].T)
+    passing = np.ascontiguousarray(rays[naive_pose.even(len(rays), 90)].T)
+    n, m = points.shape[1], passing.shape[1]
+    work, told = Scratch.new(), np.zeros(residuals.TOLD)
     work.J[:] = np.nan  # what an earlier fit may have left
-    place = (TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m, state, work.J, work.A, told)
-    cost = align.linearise(points, len(points), passing, len(passing), modes, 4.0, upright, True, *place)
+    place = (TEMPLATE, state, work.J, work.A, told)
+    cost = align.linearise(points, n, passing, m, modes, 4.0, upright, True, *place)
     A = work.A.copy()
     wanted = naive_pose.linearise(samples, rays, (150, 90), modes, 4.0, upright, TEMPLATE, state)
     size = 7 + modes
     np.testing.assert_allclose(cost, wanted[0], rtol=1e-9)
     np.testing.assert_allclose(np.triu(A[:size, :size]), np.triu(wanted[1]), rtol=1e-6, atol=1e-3)
-    np.testing.assert_allclose(A[:size, align.RESIDUAL], wanted[2], rtol=1e-6, atol=1e-4)
+    np.testing.assert_allclose(A[:size, residuals.RESIDUAL], wanted[2], rtol=1e-6, atol=1e-4)
     np.testing.assert_allclose(told[:3], wanted[3], rtol=1e-9)
-    assert told[align.CROSSED] > 0
+    assert told[residuals.CROSSED] > 0
     work.A[:] = 0.0
-    alone = align.linearise(points, len(points), passing, len(passing), modes, 4.0, upright, False, *place)
+    alone = align.linearise(points, n, passing, m, modes, 4.0, upright, False, *place)
     assert alone == cost
     assert not work.A.any()
 
 
+@pytest.mark.parametrize("away", [0.0, 0.15, 5.0], ids=["near", "half outside", "outside"])
+@pytest.mark.parametrize(("n", "m"), [(20, 0), (32, 1), (33, 31), (240, 120), (400, 400)])
+def test_any_number_of_points_and_rays_equals_the_naive_twin(n, m, away):
+    rng = np.random.default_rng(n)
+    samples, rays = rng.normal(0.0, 0.08, (n, nearby.SAMPLE)), rng.normal(0.0, 0.08, (m, nearby.RAY))
+    samples[:, 0] += away
+    samples[:, 6:] = rng.uniform(0.001, 0.05, (n, 2))
+    for directions in (samples[:, 3:6], rays[:, 3:6]):
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    state, work, told = random_state(rng), Scratch.new(), np.zeros(residuals.TOLD)
+    work.J[:] = np.nan
+    cost = align.linearise(
+        samples.T.copy(), n, rays.T.copy(), m, trials.FINE_MODES, 3.0, True, True, TEMPLATE, state, work.J,
+        work.A, told,
+    )  # fmt: skip
+    size = 7 + trials.FINE_MODES
+    wanted = naive_pose.linearise(samples, rays, (n, m), trials.FINE_MODES, 3.0, True, TEMPLATE, state)
+    np.testing.assert_allclose(cost, wanted[0], rtol=1e-9)
+    np.testing.assert_allclose(np.triu(work.A[:size, :size]), np.triu(wanted[1]), rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(work.A[:size, residuals.RESIDUAL], wanted[2], rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(told[:3], wanted[3], rtol=1e-9)
+    if away == 5.0:
+        assert told[residuals.ON_SURFACE] == 0
+        assert told[residuals.COST] == 4.5 * n
+
+
 def cost_of_a_point_behind(ray_x, sigma):
     """Twice what a point on the back of the mean head costs, seen along ``ray_x`` (1: through the face)."""
-    rows = TEMPLATE.rows[..., 0]
+    rows = TEMPLATE.rows[:, 0].reshape(TEMPLATE.shape)
     y, z = (int(-TEMPLATE.low[a] / TEMPLATE.voxel_m) for a in (1, 2))
     x = int(np.argmax(rows[:, y, z] < 0.0))  # the first voxel inside, from behind
     place = TEMPLATE.low + (np.array([x, y, z]) + 0.5) * TEMPLATE.voxel_m
-    samples = np.array([[*place, ray_x, 0.0, 0.0, sigma, 0.001]])
-    state, work, told = np.zeros(align.STATE), Scratch.new(), np.zeros(align.TOLD)
+    samples = np.array([[*place, ray_x, 0.0, 0.0, sigma, 0.001]]).T.copy()
+    state, work, told = np.zeros(residuals.STATE), Scratch.new(), np.zeros(residuals.TOLD)
     state[[3, 7, 11]] = 1.0
     cost = align.linearise(
-        samples, 1, np.zeros((0, 6)), 0, 0, 2.5, False, True, TEMPLATE.rows, TEMPLATE.low, TEMPLATE.voxel_m, state,
-        work.J, work.A, told,
+        samples, 1, np.zeros((6, 0)), 0, 0, 2.5, False, True, TEMPLATE, state, work.J, work.A, told,
     )  # fmt: skip
-    return 2.0 * cost, told[align.COST]
+    return 2.0 * cost, told[residuals.COST]
 
 
 def test_a_point_on_a_surface_that_faces_away_costs_more_the_less_noise_there_is():
@@ -176,15 +203,15 @@ def test_one_start_equals_the_naive_twin(views):
         trials.polish(scratch, tried, 0, 0, TEMPLATE)
         state, told, covariance = naive_pose.polish_one(samples, rays, state, True, TEMPLATE)
         np.testing.assert_allclose(tried.states[0, 0], state, atol=1e-6)
-        np.testing.assert_allclose(tried.told[0, 0, : align.EVIDENCE], told, rtol=1e-6)
+        np.testing.assert_allclose(tried.told[0, 0, : residuals.EVIDENCE], told, rtol=1e-6)
         np.testing.assert_allclose(tried.covariances[0], covariance, rtol=1e-4, atol=1e-12)
 
 
 def scattered(rng, count):
     """What a fit may come to: states about one another, what they cost, and covariances."""
     work = settle.Refined(
-        np.zeros((trials.MOST_REFINED, align.STATE)),
-        np.zeros((trials.MOST_REFINED, align.TOLD)),
+        np.zeros((trials.MOST_REFINED, residuals.STATE)),
+        np.zeros((trials.MOST_REFINED, residuals.TOLD)),
         np.zeros((6, 6)),
     )
     for s in range(count):
@@ -194,7 +221,7 @@ def scattered(rng, count):
             work.states[s, 3:12] = (work.states[0, 3:12].reshape(3, 3) @ half).reshape(9)
     root = rng.normal(0, 0.02, (6, 6))
     work.covariance[:] = root @ root.T
-    work.told[:, align.EVIDENCE] = rng.normal(0, 10, len(work.told))
+    work.told[:, residuals.EVIDENCE] = rng.normal(0, 10, len(work.told))
     return work
 
 
@@ -203,10 +230,10 @@ def test_settling_equals_the_naive_twin(seed):
     rng = np.random.default_rng(seed)
     count = 1 + seed % trials.MOST_REFINED
     work, centre, poses = scattered(rng, count), rng.normal(size=3), Poses.unknown(np.zeros((2, 3)))
-    best = int(np.argmin(work.told[:count, align.EVIDENCE]))
+    best = int(np.argmin(work.told[:count, residuals.EVIDENCE]))
     if seed % 4 == 3:
-        work.told[(best + 1) % count, align.EVIDENCE] = (
-            np.nan if count > 1 else work.told[best, align.EVIDENCE]
+        work.told[(best + 1) % count, residuals.EVIDENCE] = (
+            np.nan if count > 1 else work.told[best, residuals.EVIDENCE]
         )
     settle.settle(work, count, best, centre, TEMPLATE, poses, 1)
     wanted = naive_pose.settle(work, count, best, centre, TEMPLATE)

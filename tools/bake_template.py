@@ -35,8 +35,9 @@ from headvox.frames import inverse, transform
 from headvox.machine.kernels import kernel
 from headvox.machine.threads import Threads
 from headvox.parallel.workers import Workers
-from headvox.pose.align import EVIDENCE, SCALE_SIGMA
+from headvox.pose.align import SCALE_SIGMA
 from headvox.pose.fit import FitMemory, fit_poses
+from headvox.pose.residuals import EVIDENCE
 from headvox.pose.trials import STANDS, TRIED
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.people import Person, PosedBody, pose_person, sample_person, sample_pose

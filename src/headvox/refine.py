@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from headvox.machine.cholesky import factor, substitute
+from headvox.machine.cholesky import factor, substitute, substitute_back
 from headvox.machine.kernels import bare_kernel, kernel, rule
 from headvox.machine.simd import LANES, add, beginning, fill, load, mul, sub, total
 
@@ -131,6 +131,7 @@ def take_step(sums, A, b, sphere):
         b[row] = sums[RIGHT + row]
     factor(A, 4)
     substitute(A, b, 4)
+    substitute_back(A, b, 4)
     for i in range(4):
         sphere[i] += b[i]
     return np.sqrt(sums[SQUARES] / max(sums[WEIGHTS], 1e-9))

@@ -10,9 +10,9 @@ from numba import cuda
 from headvox.assemble import MOST_POSES, SAME_HEAD_M
 from headvox.cuda import nearby, pose, refine
 from headvox.cuda.lanes import SIMULATED
-from headvox.pose.align import PARAMETERS, STATE, TOLD
 from headvox.pose.fit import Poses, all_turns, upright_turns
 from headvox.pose.nearby import MOST_SAMPLES, RAY, SAMPLE
+from headvox.pose.residuals import ROWS, STATE, TOLD
 from headvox.pose.settle import Refined
 from headvox.pose.template import load_template
 from headvox.pose.trials import (
@@ -57,11 +57,11 @@ class Fits:
     def _make_room_for_poses(self, frames: int, rows: int) -> None:
         each = MOST_STARTS + 1
         self.samples, self.rays = _reals(rows, MOST_SAMPLES, SAMPLE), _reals(rows, MOST_SAMPLES, RAY)
-        self.points = _reals(rows, FINE_SAMPLES + COARSE_SAMPLES + POLISH_SAMPLES, SAMPLE)
-        self.passing = _reals(rows, FINE_RAYS + POLISH_RAYS, RAY)
+        self.points = _reals(rows, SAMPLE, FINE_SAMPLES + COARSE_SAMPLES + POLISH_SAMPLES)
+        self.passing = _reals(rows, RAY, FINE_RAYS + POLISH_RAYS)
         self.turns = _reals(rows, 9)
         self.pose_blocks = max(POSE_BLOCKS // frames, 1)
-        self.scratch = _reals(frames * self.pose_blocks, PARAMETERS + 3, pose.COLUMNS)
+        self.scratch = _reals(frames * self.pose_blocks, ROWS, pose.COLUMNS)
         self.starts = pose.Starts(
             *(_reals(rows, each, *shape) for shape in ((), (STATE,), (STATE,), (TOLD,)))
         )

@@ -53,7 +53,7 @@ def _math() -> ModuleType:
     stand_in = ModuleType("math_on_device")
     for name in ("sqrt", "exp", "log", "sin", "cos", "floor", "ceil", "isfinite", "inf", "nan"):
         setattr(stand_in, name, getattr(math, name))
-    vars(stand_in).update(arctan2=math.atan2, float64=np.float64, int64=np.int64)
+    vars(stand_in).update(arctan2=math.atan2, float64=np.float64, int64=np.int64, uint64=np.uint64)
     return stand_in
 
 
@@ -76,6 +76,12 @@ def load(flat, at):
 def store(flat, at, value):
     """Set the item of ``flat`` at ``at``."""
     flat[at] = value
+
+
+@device
+def total(a):
+    """Return ``a``, the sum of all lanes."""
+    return a
 
 
 @device

@@ -136,9 +136,9 @@ def gather(
 ):
     """Fill ``samples`` (frames * heads, S, SAMPLE) and ``rays`` (frames * heads, R, RAY) with what is near each head.
 
-    ``near`` (frames, heads, 3) tells how many there are; ``points`` (frames * heads, FINE_SAMPLES + COARSE_SAMPLES +
-    POLISH_SAMPLES, SAMPLE) and ``passing`` (frames * heads, FINE_RAYS + POLISH_RAYS, RAY) receive those that are used,
-    evenly of all, and ``turns`` (frames * heads, 9) the rotation that is expected of each head, NaN where none is.
+    ``near`` (frames, heads, 3) tells how many there are; ``points`` (frames * heads, SAMPLE, FINE_SAMPLES +
+    COARSE_SAMPLES + POLISH_SAMPLES) and ``passing`` (frames * heads, RAY, FINE_RAYS + POLISH_RAYS) receive those that
+    are used, evenly of all, and ``turns`` (frames * heads, 9) the rotation that is expected of each head, or NaN.
     """
     found = cuda.shared.array((MOST_THREADS, 2), np.int32)
     around = cuda.shared.array((MOST_THREADS, 5), np.float64)
@@ -249,9 +249,9 @@ def gather(
 
 @device
 def copy_evenly(source, there, most, target, first):
-    """Copy at most ``most`` of the rows that are ``there`` to those of ``target`` from ``first`` on."""
+    """Copy at most ``most`` of the rows that are ``there`` to the columns of ``target`` from ``first`` on."""
     used = min(there, most)
     for s in range(cuda.threadIdx.x, used, cuda.blockDim.x):
         at = _evenly(s, used, there)
         for j in range(source.shape[1]):
-            target[first + s, j] = source[at, j]
+            target[j, first + s] = source[at, j]

@@ -14,26 +14,13 @@ from numba import cuda
 
 from headvox.assemble import MOST_POSES
 from headvox.cuda.blocks import share_of, sum_rows
-from headvox.cuda.lanes import MATH, device, kernel, on_device, wait_for_block
+from headvox.cuda.lanes import MATH, add, device, kernel, load, on_device, total, wait_for_block
 from headvox.cuda.nearby import RAYS, ROUND, SAMPLES
 from headvox.cuda.suppress import HEADS
-from headvox.machine.cholesky import substitute
-from headvox.pose.align import (
-    EVIDENCE,
-    PARAMETERS,
-    RESIDUAL,
-    STATE,
-    TOLD,
-    WEIGHT,
-    WEIGHTED,
-    add_prior_cost,
-    add_priors,
-    add_turn,
-    invert_column,
-    move,
-    weigh,
-    weight_of_each,
-)
+from headvox.machine.cholesky import LEAST_PIVOT, substitute, substitute_back
+from headvox.pose import residuals
+from headvox.pose.align import add_prior_cost, add_priors, add_turn, invert_column, move
+from headvox.pose.residuals import EVIDENCE, PARAMETERS, RESIDUAL, STATE, TOLD, weigh, weight_of_each
 from headvox.pose.settle import Refined, assess, column, odds, quaternion_of, recentre, settle, turn_between
 from headvox.pose.template import FINE_MODES, MODES
 from headvox.pose.trials import (
@@ -57,14 +44,42 @@ from headvox.pose.trials import (
 )
 
 MOST_THREADS = 128  # of a block; a power of two
+SYSTEM = PARAMETERS + 1  # columns of A: the last is the residual's
 COLUMNS = max(FINE_SAMPLES + FINE_RAYS, POLISH_SAMPLES + POLISH_RAYS)
-SYSTEM = PARAMETERS + 1  # rows and columns of A: the last ones are the residual's
 
-_weigh = on_device(weigh, np=MATH)
+_whole_vectors = on_device(residuals.whole_vectors, LANES=1)
+_in_registers = on_device(residuals.in_registers)
+_place = on_device(residuals.place, np=MATH)
+_corner = on_device(residuals.corner)
+_copy_row = on_device(residuals.copy_row)
+_off_middle = on_device(residuals.off_middle, np=MATH)
+_weigh = on_device(
+    weigh,
+    np=MATH,
+    whole_vectors=_whole_vectors,
+    place_points=on_device(
+        residuals.place_points, np=MATH, in_registers=_in_registers, corner=_corner, place=_place
+    ),
+    look_up=on_device(residuals.look_up, np=MATH, copy_row=_copy_row),
+    add_shape=on_device(residuals.add_shape, np=MATH, corner=_corner, off_middle=_off_middle),
+    add_noise=on_device(residuals.add_noise, np=MATH, in_registers=_in_registers),
+    clear=on_device(residuals.clear),
+    place_rays=on_device(
+        residuals.place_rays, np=MATH, in_registers=_in_registers, corner=_corner, place=_place
+    ),
+    keep_crossing=on_device(
+        residuals.keep_crossing, np=MATH, copy_row=_copy_row, corner=_corner, off_middle=_off_middle
+    ),
+    weigh_columns=on_device(residuals.weigh_columns, np=MATH),
+    differentiate=on_device(residuals.differentiate, np=MATH),
+    sum_of=on_device(residuals.sum_of, LANES=1, load=load, add=add, total=total),
+)
 _weight_of_each = on_device(weight_of_each)
 _add_prior_cost = on_device(add_prior_cost)
 _add_priors = on_device(add_priors, add_turn=on_device(add_turn))
-_invert_column = on_device(invert_column, substitute=on_device(substitute))
+_invert_column = on_device(
+    invert_column, substitute=on_device(substitute), substitute_back=on_device(substitute_back)
+)
 _move = on_device(move, np=MATH)
 _is_trusted = on_device(is_trusted)
 _pick = on_device(pick, np=MATH)
@@ -85,24 +100,24 @@ class Starts(NamedTuple):
 
 @device
 def factor(A, size, thread, threads):
-    """Leave the Cholesky factor in the lower half of A, and what solves L x = -(column RESIDUAL) in its last row.
+    """Leave U in the upper half of A, A = Uᵀ U, and what solves Uᵀ x = (column RESIDUAL) in that column.
 
-    All threads of a block call this: as :func:`headvox.pose.align.solve`, a column at a time.
+    All threads of a block call this: as :func:`headvox.machine.cholesky.factor`, a row at a time.
     """
-    for j in range(size):
+    for i in range(size):
         wait_for_block()
         if thread == 0:
-            v = A[j, j]
-            for q in range(j):
-                v -= A[j, q] * A[j, q]
-            A[j, j] = MATH.sqrt(max(v, 1e-12))
+            v = A[i, i]
+            for q in range(i):
+                v -= A[q, i] * A[q, i]
+            A[i, i] = MATH.sqrt(max(v, LEAST_PIVOT))
         wait_for_block()
-        for i in range(j + 1 + thread, size + 1, threads):
-            row = i if i < size else PARAMETERS
-            v = A[j, i] if i < size else -A[j, RESIDUAL]
-            for q in range(j):
-                v -= A[row, q] * A[j, q]
-            A[row, j] = v / A[j, j]
+        for j in range(i + 1 + thread, size + 1, threads):
+            column = j if j < size else RESIDUAL
+            v = A[i, column]
+            for q in range(i):
+                v -= A[q, i] * A[q, column]
+            A[i, column] = v / A[i, i]
     wait_for_block()
 
 
@@ -111,9 +126,9 @@ def solve_back(A, size, x):
     """Write the step to ``x``, and return half the logarithm of the determinant."""
     half_log_det = 0.0
     for i in range(size - 1, -1, -1):
-        v = A[PARAMETERS, i]
+        v = -A[i, RESIDUAL]
         for q in range(i + 1, size):
-            v -= A[q, i] * x[q]
+            v -= A[i, q] * x[q]
         x[i] = v / A[i, i]
         half_log_det += MATH.log(A[i, i])
     return half_log_det
@@ -121,7 +136,7 @@ def solve_back(A, size, x):
 
 @device
 def accumulate(J, count, size, A, thread, threads):
-    """Set the upper half of A to J W Jᵀ over ``count`` columns, and its last column to J W e: an entry a thread."""
+    """Set the upper half of A to J Jᵀ over ``count`` columns, and its last column to J e: an entry a thread."""
     entries = size * (size + 1) // 2 + size
     for entry in range(thread, entries, threads):
         i, left = 0, entry
@@ -129,10 +144,10 @@ def accumulate(J, count, size, A, thread, threads):
             left -= size + 1 - i
             i += 1
         j = i + left if i + left < size else RESIDUAL
-        total = 0.0
+        product_sum = 0.0
         for s in range(count):
-            total += J[i, s] * J[WEIGHT, s] * J[j, s]
-        A[i, j] = total
+            product_sum += J[i, s] * J[j, s]
+        A[i, j] = product_sum
     wait_for_block()
 
 
@@ -145,10 +160,10 @@ def linearise(
     c, d = share_of(m, thread, threads)
     mine = J[:, a + c : b + d]
     cost, count = _weigh(
-        points[first + a : first + b], b - a, _weight_of_each(n), rays[c:d], d - c, modes, k, True, template.rows,
-        template.low, template.voxel_m, state, mine, told[thread],
+        points[:, first + a : first + b], b - a, _weight_of_each(n), rays[:, c:d], d - c, modes, k, True, template,
+        state, mine, told[thread],
     )  # fmt: skip
-    for i in range(WEIGHTED):
+    for i in range(PARAMETERS + 1):
         for s in range(count, b + d - a - c):
             mine[i, s] = 0.0
     costs[thread, 0] = cost
@@ -165,7 +180,7 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
     """Fit each start of each head: coarsely, but for the expected one, then to the end. ``scratch`` has a J a block."""
     told = cuda.shared.array((MOST_THREADS, TOLD), np.float64)
     costs = cuda.shared.array((MOST_THREADS, 1), np.float64)
-    A = cuda.shared.array((SYSTEM, SYSTEM), np.float64)
+    A = cuda.shared.array((PARAMETERS, SYSTEM), np.float64)
     state = cuda.shared.array(STATE, np.float64)
     x = cuda.shared.array(PARAMETERS, np.float64)
     frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
@@ -301,7 +316,7 @@ def settle_heads(
     """
     told = cuda.shared.array((MOST_THREADS, TOLD), np.float64)
     costs = cuda.shared.array((MOST_THREADS, 1), np.float64)
-    A = cuda.shared.array((SYSTEM, SYSTEM), np.float64)
+    A = cuda.shared.array((PARAMETERS, SYSTEM), np.float64)
     x = cuda.shared.array((6, PARAMETERS), np.float64)
     found = cuda.shared.array(2, np.int64)
     frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
@@ -327,7 +342,7 @@ def settle_heads(
             more, passes = min(n, POLISH_SAMPLES), min(m, POLISH_RAYS)
             for step in range(POLISH_STEPS + 1):
                 linearise(
-                    points[i], FINE_SAMPLES + COARSE_SAMPLES, more, passing[i, FINE_RAYS:], passes, MODES, LAST_K,
+                    points[i], FINE_SAMPLES + COARSE_SAMPLES, more, passing[i, :, FINE_RAYS:], passes, MODES, LAST_K,
                     stands, template, state, J, A, told, costs, thread, threads,
                 )  # fmt: skip
                 factor(A, PARAMETERS, thread, threads)

@@ -14,7 +14,7 @@ from headvox.cuda.gate import cell_of
 from headvox.cuda.lanes import MATH, device, kernel, on_device, product_64
 from headvox.cuda.readings import EXPECTED, EXPECTED_AT, HAIRED, LEAST, ORIGIN, THRESHOLD
 from headvox.cuda.suppress import HEADS, JUDGED, KEPT
-from headvox.machine.cholesky import factor, substitute
+from headvox.machine.cholesky import factor, substitute, substitute_back
 from headvox.refine import (
     HAIR_M,
     RADIUS,
@@ -37,7 +37,11 @@ _add_part = on_device(
 )
 _add_priors = on_device(add_priors, np=MATH)
 _take_step = on_device(
-    take_step, np=MATH, factor=on_device(factor, np=MATH), substitute=on_device(substitute)
+    take_step,
+    np=MATH,
+    factor=on_device(factor, np=MATH),
+    substitute=on_device(substitute),
+    substitute_back=on_device(substitute_back),
 )
 
 

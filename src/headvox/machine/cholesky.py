@@ -1,4 +1,4 @@
-"""Small positive definite systems: A = L Lᵀ, by Cholesky, in place."""
+"""Small positive definite systems: A = Uᵀ U, by Cholesky, in place."""
 
 from __future__ import annotations
 
@@ -11,30 +11,43 @@ LEAST_PIVOT = 1e-12
 
 @rule
 def factor(A, size):
-    """Leave L in the lower half of A (size, >= size), whose upper half is read; return half the log determinant."""
-    half_log_det = 0.0
+    """Leave U in the upper half of A (size, >= size), and what solves Uᵀ y = b in place of each column b behind it.
+
+    Of A the upper half is read; the lower is left as it is.
+    """
+    for q in range(size):
+        pivot = np.sqrt(max(A[q, q], LEAST_PIVOT))
+        A[q, q] = pivot
+        for j in range(q + 1, A.shape[1]):
+            A[q, j] /= pivot
+        for i in range(q + 1, size):
+            share = A[q, i]
+            for j in range(i, A.shape[1]):
+                A[i, j] -= share * A[q, j]
+
+
+@rule
+def half_log_determinant(A, size):
+    """Return half the logarithm of the determinant of Uᵀ U, U the upper half of A."""
+    half = 0.0
     for i in range(size):
-        for j in range(i + 1):
-            v = A[j, i]
-            for q in range(j):
-                v -= A[i, q] * A[j, q]
-            if i == j:
-                v = np.sqrt(max(v, LEAST_PIVOT))
-                half_log_det += np.log(v)
-                A[i, i] = v
-            else:
-                A[i, j] = v / A[j, j]
-    return half_log_det
+        half += np.log(A[i, i])
+    return half
 
 
 @rule
 def substitute(A, x, size):
-    """Replace ``x`` (size,) by what solves L Lᵀ y = x, L the lower half of A: forward, then back substitution."""
+    """Replace ``x`` (size,) by what solves Uᵀ y = x, U the upper half of A."""
     for i in range(size):
-        for q in range(i):
-            x[i] -= A[i, q] * x[q]
         x[i] /= A[i, i]
+        for j in range(i + 1, size):
+            x[j] -= A[i, j] * x[i]
+
+
+@rule
+def substitute_back(A, x, size):
+    """Replace ``x`` (size,) by what solves U y = x, U the upper half of A."""
     for i in range(size - 1, -1, -1):
-        for q in range(i + 1, size):
-            x[i] -= A[q, i] * x[q]
+        for j in range(i + 1, size):
+            x[i] -= A[i, j] * x[j]
         x[i] /= A[i, i]

@@ -9,7 +9,7 @@ import numpy as np
 from headvox.data import F64
 from headvox.machine.kernels import bare_kernel, rule
 from headvox.machine.threads import take
-from headvox.pose.align import COST, CROSSED, EVIDENCE, ON_SURFACE
+from headvox.pose.residuals import COST, CROSSED, EVIDENCE, ON_SURFACE
 from headvox.pose.template import MODES
 from headvox.pose.trials import MORE_POINTS, MORE_RAYS, STANDS, TRIED, best_of, polish
 

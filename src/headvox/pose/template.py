@@ -19,10 +19,10 @@ ROW = 2 * LINE  # distance, gradient (3), sigma, modes, the rest unused
 class Template(NamedTuple):
     """The mean head on a grid in its own frame, made by ``tools/bake_template.py``.
 
-    ``rows`` (X, Y, Z, ROW) float32: of each voxel's centre the signed distance to the surface (m, above zero
+    ``rows`` (X * Y * Z, ROW) float32: of each voxel's centre the signed distance to the surface (m, above zero
     outside), its gradient, the standard deviation (m) of a real surface from the fitted one, and the change of the
-    distance (m) for a step of one standard deviation along each mode of shape. ``low`` (3,) is the corner of the first
-    voxel, ``radius_m`` that of the sphere that fits the mean head.
+    distance (m) for a step of one standard deviation along each mode of shape. ``shape`` is X, Y, Z, ``low`` (3,) the
+    corner of the first voxel, ``radius_m`` the radius of the sphere that fits the mean head.
 
     The others are learnt from what fits of known heads were off by. The first three turn what a fit costs into
     probabilities: two poses whose evidence differs by ``temperature`` are e times as probable, and the covariances of
@@ -32,6 +32,7 @@ class Template(NamedTuple):
     """
 
     rows: F32
+    shape: tuple[int, int, int]
     low: F64
     voxel_m: float
     radius_m: float
@@ -57,7 +58,8 @@ def load_template() -> Template:
     rows[..., 1:4] = np.stack(np.gradient(mean, voxel_m), axis=-1)
     rows[..., 4] = sigma
     rows[..., 5 : 5 + MODES] = np.moveaxis(modes, 0, -1)
-    return Template(rows, low, voxel_m, 0.5 * size_m, temperature, shift, turn, of_shape)
+    flat = rows.reshape(-1, ROW)
+    return Template(flat, mean.shape, low, voxel_m, 0.5 * size_m, temperature, shift, turn, of_shape)
 
 
 def _aligned(shape: tuple[int, ...]) -> F32:

@@ -11,15 +11,20 @@ from typing import NamedTuple
 import numpy as np
 
 from headvox.data import F64, I64
+from headvox.machine.cholesky import half_log_determinant
 from headvox.machine.kernels import bare_kernel, rule
+from headvox.machine.simd import LANES
 from headvox.machine.threads import take
-from headvox.pose.align import COST, EVIDENCE, PARAMETERS, ROOM, STATE, TOLD, invert, linearise, move, solve
+from headvox.pose.align import invert, linearise, move, solve
 from headvox.pose.nearby import MOST_SAMPLES, RAY, SAMPLE
-from headvox.pose.template import FINE_MODES, MODES
+from headvox.pose.residuals import COST, EVIDENCE, PARAMETERS, ROWS, STATE, TOLD
+from headvox.pose.template import FINE_MODES, LINE, MODES
 
 COARSE_STEPS, FINE_STEPS, POLISH_STEPS = 4, 5, 2
 COARSE_SAMPLES, FINE_SAMPLES, POLISH_SAMPLES = 120, 240, 400
 FINE_RAYS, POLISH_RAYS = 120, 400
+# Of a row of the Jacobian: all points and all rays in whole vectors, and an odd number of lines of the cache.
+ROOM = LANES * (-(-POLISH_SAMPLES // LANES) - (-POLISH_RAYS // LANES)) + LINE // 2
 COARSE_MODES = 0
 # Of the first coarse step (1 less each step), the first and the last fine one.
 COARSE_K, FINE_K, LAST_K = 4.0, 4.0, 2.5
@@ -43,9 +48,9 @@ class Scratch(NamedTuple):
     rays: F64
     """(MOST_SAMPLES, RAY)"""
     points: F64
-    """(COARSE_SAMPLES, SAMPLE) those of the samples that all starts are tried on"""
+    """(SAMPLE, COARSE_SAMPLES) those of the samples that all starts are tried on"""
     J: F64
-    """(PARAMETERS + 3, ROOM) the Jacobian, a column a point; residuals, weights and scrap"""
+    """(ROWS, ROOM) the Jacobian, a column a point, and what leads to it"""
     A: F64
     """(PARAMETERS, PARAMETERS + 1) the normal equations"""
     x: F64
@@ -61,8 +66,8 @@ class Scratch(NamedTuple):
     def new(cls) -> Scratch:
         """Return the memory for one thread, all zeros."""
         return cls(
-            np.zeros((MOST_SAMPLES, SAMPLE)), np.zeros((MOST_SAMPLES, RAY)), np.zeros((COARSE_SAMPLES, SAMPLE)),
-            np.zeros((PARAMETERS + 3, ROOM)), np.zeros((PARAMETERS, PARAMETERS + 1)), np.zeros(PARAMETERS),
+            np.zeros((MOST_SAMPLES, SAMPLE)), np.zeros((MOST_SAMPLES, RAY)), np.zeros((SAMPLE, COARSE_SAMPLES)),
+            np.zeros((ROWS, ROOM)), np.zeros((PARAMETERS, PARAMETERS + 1)), np.zeros(PARAMETERS),
             np.zeros(MOST_STARTS), np.zeros((MOST_STARTS, STATE)), np.zeros(TOLD),
         )  # fmt: skip
 
@@ -71,13 +76,13 @@ class Trials(NamedTuple):
     """What is tried of some heads: a row a head."""
 
     points: F64
-    """(H, FINE_SAMPLES, SAMPLE) the samples that states are refined on, and"""
+    """(H, SAMPLE, FINE_SAMPLES) the samples that states are refined on, and"""
     passing: F64
-    """(H, FINE_RAYS, RAY) the rays"""
+    """(H, RAY, FINE_RAYS) the rays"""
     more_points: F64
-    """(H, POLISH_SAMPLES, SAMPLE) the samples that the best state is polished on, and"""
+    """(H, SAMPLE, POLISH_SAMPLES) the samples that the best state is polished on, and"""
     more_passing: F64
-    """(H, POLISH_RAYS, RAY) the rays"""
+    """(H, RAY, POLISH_RAYS) the rays"""
     counts: I64
     """(H, COUNTS) how many of these, whether gravity holds, how many states are tried, and how many refined at once"""
     states: F64
@@ -93,8 +98,8 @@ class Trials(NamedTuple):
     def new(cls, heads: int) -> Trials:
         """Return the memory for as many ``heads``, all zeros."""
         return cls(
-            np.zeros((heads, FINE_SAMPLES, SAMPLE)), np.zeros((heads, FINE_RAYS, RAY)),
-            np.zeros((heads, POLISH_SAMPLES, SAMPLE)), np.zeros((heads, POLISH_RAYS, RAY)),
+            np.zeros((heads, SAMPLE, FINE_SAMPLES)), np.zeros((heads, RAY, FINE_RAYS)),
+            np.zeros((heads, SAMPLE, POLISH_SAMPLES)), np.zeros((heads, RAY, POLISH_RAYS)),
             np.zeros((heads, COUNTS), np.int64), np.zeros((heads, MOST_REFINED, STATE)),
             np.zeros((heads, MOST_REFINED, TOLD)), np.zeros((heads, 6, 6)),
             np.zeros((heads * MOST_REFINED, 2), np.int64),
@@ -109,12 +114,12 @@ def evenly(s, used, there):
 
 @rule
 def choose(source, there, target, most):
-    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all; return how many."""
+    """Copy at most ``most`` of the first ``there`` rows of ``source``, evenly over all, to columns; return how many."""
     used = min(there, most)
     for s in range(used):
         at = evenly(s, used, there)
         for j in range(source.shape[1]):
-            target[s, j] = source[at, j]
+            target[j, s] = source[at, j]
     return used
 
 
@@ -208,8 +213,8 @@ def explore(work, used, rays, starts, upright, template):
         for step in range(COARSE_STEPS + 1):
             k, steps = COARSE_K - min(step, COARSE_STEPS - 1), step < COARSE_STEPS
             work.costs[i] = linearise(
-                work.points, used, rays, none, modes, k, upright, steps, template.rows, template.low,
-                template.voxel_m, state, work.J, A, work.told,
+                work.points, used, rays, none, modes, k, upright, steps, template, state, work.J, A,
+                work.told,
             )  # fmt: skip
             if steps:
                 solve(A, x, 7 + modes)
@@ -290,11 +295,12 @@ def refine(work, trials, i, at, template):
         k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
         cost = linearise(
             trials.points[i], counts[POINTS], trials.passing[i], counts[RAYS], modes, k, counts[STANDS] != 0, always,
-            template.rows, template.low, template.voxel_m, state, work.J, A, told,
+            template, state, work.J, A, told,
         )  # fmt: skip
-        told[EVIDENCE] = cost + solve(A, x, 7 + modes)
+        solve(A, x, 7 + modes)
         if step < FINE_STEPS:
             move(state, x, 7 + modes)
+    told[EVIDENCE] = cost + half_log_determinant(A, 7 + modes)
 
 
 @rule
@@ -318,7 +324,7 @@ def polish(work, trials, i, at, template):
     for step in range(POLISH_STEPS + 1):
         linearise(
             trials.more_points[i], counts[MORE_POINTS], trials.more_passing[i], counts[MORE_RAYS], modes, LAST_K,
-            counts[STANDS] != 0, always, template.rows, template.low, template.voxel_m, state, work.J, A, told,
+            counts[STANDS] != 0, always, template, state, work.J, A, told,
         )  # fmt: skip
         solve(A, x, PARAMETERS)
         if step < POLISH_STEPS:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 
 from headvox.config import DetectorConfig
@@ -152,6 +152,19 @@ def fattened(pixels: int) -> Way:
     return read_as(lambda far, rng: minimum_filter(np.where(far > 0, far, np.inf), 2 * pixels + 1))
 
 
+def smeared(pixels: int) -> Way:
+    """Let readings at edges fly between what is near and what is behind, as those of time-of-flight cameras do."""
+
+    def change(far: F32, rng: Rng) -> F32:
+        near = minimum_filter(np.where(far > 0, far, np.inf), 2 * pixels + 1)
+        behind = maximum_filter(far, 2 * pixels + 1)
+        between = np.minimum(near, behind)
+        between += (behind - between) * rng.random(far.shape).astype(np.float32)
+        return np.where(near < behind - BEHIND_M, between, far).astype(np.float32)
+
+    return read_as(change)
+
+
 WAYS: dict[str, Way] = {
     "as they are": as_it_is,
     "mirrored": mirrored,
@@ -167,6 +180,8 @@ WAYS: dict[str, Way] = {
     "shadows of 6 pixels beside edges": shadowed(6),
     "edges fattened by 1 pixel": fattened(1),
     "edges fattened by 2 pixels": fattened(2),
+    "edges that fly, 1 pixel to either side": smeared(1),
+    "edges that fly, 2 pixels to either side": smeared(2),
     "nothing beyond 4.5 m": read_as(lambda far, rng: np.where(far > 4.5, 0.0, far).astype(np.float32)),
     "background and floor removed": alone,
 }

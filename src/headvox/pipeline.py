@@ -1,4 +1,4 @@
-"""The detector: a frame in, heads out. :meth:`Detector.detect_frame` is the whole flow, one line a stage."""
+"""The detector: a frame in, heads out. :meth:`Detector._detect` is the whole flow, one line a stage."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from headvox.keep import Judged, asks_cameras, keep, least_before, least_score, 
 from headvox.machine.clock import Clock
 from headvox.machine.kernels import read_only
 from headvox.machine.threads import Threads, new_blocks
+from headvox.machine.turns import Turns
 from headvox.masks.compile import SCORE_UNIT, compile_cascade
 from headvox.masks.read import load_cascade
 from headvox.memory import Memory, Stages
@@ -53,7 +54,8 @@ FEW_PEAKS = 16
 class Detector:
     """Finds heads in point clouds and depth images.
 
-    A detector keeps its working memory between frames, so it is not for two threads at once: give each its own.
+    A detector keeps its working memory between frames, so it is not for two threads at once: give each its own. A call
+    while another thread's is under way raises HeadvoxError.
     ``stage_ms`` holds what each stage of the last frame took. ``backend`` goes before that of ``config``; ``note`` is
     told what a user should know, by default as a Python warning.
 
@@ -82,6 +84,7 @@ class Detector:
         self.stage_ms = dict.fromkeys(DEVICE_STAGES if self.on_device else STAGES, 0.0)
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
+        self._alone = Turns(("This Detector is at work in another thread.", "Give each thread its own."))
         self._threads = Threads(self.config.threads)
         self._placing = Placing(self.config)
         self._memory: Memory | None = None
@@ -120,27 +123,11 @@ class Detector:
         Within the reach of where a head is ``expected``, one that scores a little too low (``score_slack``) is kept
         too, and marked as not sure.
         """
-        if self.on_device:
-            return self._detect_together([frame], [expected])[0]
-        with self._threads.awake():
-            check_frame(frame)
-            clock = Clock(self.stage_ms)
-            memory = self._memory_for(frame)
-            occupied = self._voxelize(frame, memory)
-            clock.done("voxelize")
-            S = memory.volume_about(memory.candidates_about(occupied), self._threads.count)
-            survivors = self._gate(S, occupied, memory, clock)
-            clock.done("gate")
-            scores = self._vote(S, survivors, memory)
-            clock.done("vote")
-            self._looked_at = (memory, survivors, scores)
-            peaks = self._suppress(S, survivors, scores, memory)
-            clock.done("suppress")
-            judged = self._judge(frame, S, survivors, scores, peaks, memory, expected)
-            clock.done("judge")
-            heads = self._refine(frame, judged, memory, expected)
-            clock.done("refine")
-            return heads
+        with self._alone:
+            if self.on_device:
+                return self._detect_together([frame], [expected])[0]
+            with self._threads.awake():
+                return self._detect(frame, expected)
 
     def detect_batch(self, frames: Sequence[Frame]) -> list[Heads]:
         """Return the heads in each of ``frames``, as :meth:`detect_frame` does; on a GPU, several go at once.
@@ -149,7 +136,8 @@ class Detector:
             HeadvoxError: as :meth:`detect_frame`; of several, the first.
         """
         parts = [frames[first : first + BATCH] for first in range(0, len(frames), BATCH)]
-        return [heads for part in parts for heads in self._detect_together(part, [None] * len(part))]
+        with self._alone:
+            return [heads for part in parts for heads in self._detect_together(part, [None] * len(part))]
 
     def candidates_of_last_frame(self) -> tuple[F64, F64]:
         """Return what passed the gate of the last frame, and what the second stage gave it; for pictures and tuning.
@@ -161,15 +149,17 @@ class Detector:
             The centres of the voxels, (N, 3) metres, world, and their scores (N,), NaN where the second stage dropped
             one. The scores are those by which the peaks are found: what is said of heads comes from a closer look.
         """
-        if self._looked_at is None:
-            return np.empty((0, 3)), np.empty(0)
-        memory, survivors, scores = self._looked_at
-        centres = memory.centres(survivors)
-        return centres, np.where(scores > DROPPED, scores / SCORE_UNIT, np.nan)
+        with self._alone:
+            if self._looked_at is None:
+                return np.empty((0, 3)), np.empty(0)
+            memory, survivors, scores = self._looked_at
+            centres = memory.centres(survivors)
+            return centres, np.where(scores > DROPPED, scores / SCORE_UNIT, np.nan)
 
     def close(self) -> None:
         """End the detector's threads."""
-        self._threads.close()
+        with self._alone:
+            self._threads.close()
 
     def _detect_together(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
         """Return the heads in up to :data:`BATCH` frames: at once on a GPU; without, or when it fails, one by one."""
@@ -188,6 +178,27 @@ class Detector:
         return [self.detect_frame(frame, one) for frame, one in zip(frames, expected, strict=True)]
 
     # -------------------------------------------------------------------------------------------------- the stages
+
+    def _detect(self, frame: Frame, expected: Expected | None) -> Heads:
+        """Return the heads in ``frame``, stage by stage, on the CPU."""
+        check_frame(frame)
+        clock = Clock(self.stage_ms)
+        memory = self._memory_for(frame)
+        occupied = self._voxelize(frame, memory)
+        clock.done("voxelize")
+        S = memory.volume_about(memory.candidates_about(occupied), self._threads.count)
+        survivors = self._gate(S, occupied, memory, clock)
+        clock.done("gate")
+        scores = self._vote(S, survivors, memory)
+        clock.done("vote")
+        self._looked_at = (memory, survivors, scores)
+        peaks = self._suppress(S, survivors, scores, memory)
+        clock.done("suppress")
+        judged = self._judge(frame, S, survivors, scores, peaks, memory, expected)
+        clock.done("judge")
+        heads = self._refine(frame, judged, memory, expected)
+        clock.done("refine")
+        return heads
 
     def _voxelize(self, frame: Frame, memory: Memory) -> I64:
         """Enter every reading into the grid; return its lowest and highest occupied cell."""

@@ -1,5 +1,6 @@
 """What a detector takes, and what it refuses."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -142,6 +143,34 @@ def test_a_frame_that_is_none(make):
         make().detect_frame(BadFrame(0, "damaged."))
     with pytest.raises(HeadvoxError, match=r"expected whole nanoseconds, got 1\.5"):
         make().detect_frame(Frame(1.5, clouds=(Cloud("c", two_busts()),)))
+
+
+def test_a_second_thread_is_refused_in_the_midst_of_a_frame_and_the_first_goes_on(make, monkeypatch):
+    detector, frame = make(min_score=-2.0), Frame(0, clouds=(Cloud("c", two_busts()),))
+    wanted, gate, refused = everything(detector.detect_frame(frame)), detector._gate, []
+
+    def gate_while_others_ask(*args):
+        for ask in (
+            lambda: detector.detect(two_busts()),
+            lambda: detector.detect_depth(camera_frame().depths),
+            lambda: detector.detect_frame(frame),
+            lambda: detector.detect_batch([frame]),
+            detector.candidates_of_last_frame,
+            detector.close,
+        ):
+            with pytest.raises(HeadvoxError, match=r"at work in another thread\. Give each thread its own"):
+                other.submit(ask).result()
+            refused.append(ask)
+        return gate(*args)
+
+    with ThreadPoolExecutor(1) as other:
+        with monkeypatch.context() as patch:
+            patch.setattr(detector, "_gate", gate_while_others_ask)
+            assert everything(detector.detect_frame(frame)) == wanted
+            assert len(refused) == 6
+        with pytest.raises(HeadvoxError):
+            detector.detect(two_busts()[:0])
+        assert everything(other.submit(detector.detect_frame, frame).result()) == wanted
 
 
 def test_an_unknown_cascade_is_told_when_the_detector_is_made():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillWaiting
 from dataclasses import fields, replace
 
 import numpy as np
@@ -145,6 +147,26 @@ def test_predict_is_for_a_planner_and_changes_nothing() -> None:
     with pytest.raises(HeadvoxError, match="last frame's"):
         tracker.predict(at(28).stamp_ns)
     assert len(Tracker().predict(5)) == 0
+
+
+def test_a_planner_in_another_thread_waits_for_the_frame_that_is_taken(monkeypatch) -> None:
+    tracker, asked = Tracker(), []
+    follow(tracker, walk(30))
+    correct, stamp_ns = tracker._correct, at(31).stamp_ns
+
+    def correct_while_others_ask(*args) -> None:
+        for ask in (tracker.predict, tracker.expected):
+            asked.append(planner.submit(ask, stamp_ns))
+            with pytest.raises(StillWaiting):
+                asked[-1].result(timeout=0.05)
+        correct(*args)
+
+    with ThreadPoolExecutor(2) as planner, monkeypatch.context() as patch:
+        patch.setattr(tracker, "_correct", correct_while_others_ask)
+        follow(tracker, walk(1, 30), 30)
+        predicted, expected = (answer.result() for answer in asked)
+    np.testing.assert_array_equal(predicted.centres, tracker.predict(stamp_ns).centres)
+    np.testing.assert_array_equal(expected.centres, tracker.expected(stamp_ns).centres)
 
 
 # ------------------------------------------------------------------------------------------------------------ the clock

@@ -1,6 +1,6 @@
 """From heads to tracks: who is who, where everybody is now, and how fast.
 
-A frame is five steps: predict, associate, correct, look again and age, bear (:meth:`Tracker.update`). The filters are
+A frame is five steps: predict, associate, correct, look again and age, bear (:meth:`Tracker._take`). The filters are
 in ``kalman.py``, what tells people apart in ``identity.py``, how far measured heads may be off in ``noise.py``. Where a
 head may be that was not found is in ``unseen.py``, what keeps its track alive in ``lifetime.py``: it dies fast where
 all is seen to be empty, later where it is hidden. What is known of each track is a row of a table (``roster.py``), what
@@ -16,6 +16,7 @@ import numpy as np
 from headvox.config import TrackerConfig, given_or_default
 from headvox.data import F64, I64, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
+from headvox.machine.turns import Turns
 from headvox.tracking.identity import MOST_STRENGTH, come_back, note_sightings, pairs, price
 from headvox.tracking.kalman import (
     FIRST_RATE_RAD_S,
@@ -47,6 +48,8 @@ FIRST_TRUST = 0.15
 class Tracker:
     """Follows heads from frame to frame. Ids begin at 1 with each tracker and are never used again by it.
 
+    A thread that asks where the tracks will be, while another one's frame is taken, waits for the end of that.
+
     >>> from headvox.data import Frame, Heads
     >>> import numpy as np
     >>> tracker = Tracker()
@@ -65,6 +68,7 @@ class Tracker:
         self.untracked: Counter[str] = Counter()
         self.stamp_ns: int | None = None
         """Of the last frame that was tracked."""
+        self._turns = Turns()
         self._last_id = 0
         self._roster = blank(0)
         self._density = (self.config.speed_change_m_s * UPRIGHT) ** 2
@@ -80,8 +84,43 @@ class Tracker:
         The images of the frame tell where a head that was not found may be hidden; a frame without any will do. A
         frame whose stamp is not after the last one's is not tracked: its heads come back as tentative tracks.
         """
-        if not self._is_next(frame.stamp_ns):
-            return tentative(heads, frame.stamp_ns)
+        with self._turns:
+            if not self._is_next(frame.stamp_ns):
+                return tentative(heads, frame.stamp_ns)
+            self._take(heads, frame)
+            return report(self._roster, frame.stamp_ns, frame.stamp_ns)
+
+    def predict(self, stamp_ns: int) -> Tracks:
+        """Return where the tracks will be at a stamp that is not before the last frame's; nothing is changed.
+
+        Raises:
+            HeadvoxError: an earlier stamp.
+        """
+        with self._turns:
+            if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
+                raise HeadvoxError(
+                    f"Expected a stamp from {self.stamp_ns} ns on, the last frame's, got {stamp_ns} ns.",
+                    "Ask for the present or the future.",
+                )
+            last_ns = stamp_ns if self.stamp_ns is None else self.stamp_ns
+            return report(self._predicted(stamp_ns), last_ns, stamp_ns)
+
+    def expected(self, stamp_ns: int) -> Expected:
+        """Return where confirmed heads are expected at ``stamp_ns``, for :meth:`Detector.detect_frame`."""
+        with self._turns:
+            if self.stamp_ns is None or stamp_ns < self.stamp_ns:
+                return Expected(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
+            return expectations(self._predicted(stamp_ns))
+
+    @property
+    def ids_given(self) -> int:
+        """How many heads were confirmed so far."""
+        return self._last_id
+
+    # -------------------------------------------------------------------------------------------------- the steps
+
+    def _take(self, heads: Heads, frame: Frame) -> None:
+        """Go through the five steps with a frame that is after the last one."""
         R_centre, R_turn = measurement_noise(heads, frame)
         before_ns = frame.stamp_ns if self.stamp_ns is None else self.stamp_ns
         self._predict(before_ns, frame.stamp_ns)
@@ -91,34 +130,6 @@ class Tracker:
         new = heads.sure.copy()
         new[found] = False
         self._bear(heads, R_centre, R_turn, np.flatnonzero(new))
-        return report(self._roster, frame.stamp_ns, frame.stamp_ns)
-
-    def predict(self, stamp_ns: int) -> Tracks:
-        """Return where the tracks will be at a stamp that is not before the last frame's; nothing is changed.
-
-        Raises:
-            HeadvoxError: an earlier stamp.
-        """
-        if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
-            raise HeadvoxError(
-                f"Expected a stamp from {self.stamp_ns} ns on, the last frame's, got {stamp_ns} ns.",
-                "Ask for the present or the future.",
-            )
-        last_ns = stamp_ns if self.stamp_ns is None else self.stamp_ns
-        return report(self._predicted(stamp_ns), last_ns, stamp_ns)
-
-    def expected(self, stamp_ns: int) -> Expected:
-        """Return where confirmed heads are expected at ``stamp_ns``, for :meth:`Detector.detect_frame`."""
-        if self.stamp_ns is None or stamp_ns < self.stamp_ns:
-            return Expected(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
-        return expectations(self._predicted(stamp_ns))
-
-    @property
-    def ids_given(self) -> int:
-        """How many heads were confirmed so far."""
-        return self._last_id
-
-    # -------------------------------------------------------------------------------------------------- the steps
 
     def _is_next(self, stamp_ns: int) -> bool:
         """Whether time goes on; counts where it does not, and starts anew when it jumped back far."""

@@ -1,10 +1,16 @@
-"""What flows through headvox, as it shows itself."""
+"""What flows through headvox, as it shows itself, and as it compares."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import fields, is_dataclass
 
-from headvox.data import Heads
+import numpy as np
+import pytest
+
+from headvox import data
+from headvox.data import BadFrame, Heads, Intrinsics
+
+CLASSES = [one for one in vars(data).values() if is_dataclass(one)]
 
 
 def test_heads_show_where_they_are_in_a_line() -> None:
@@ -12,3 +18,17 @@ def test_heads_show_where_they_are_in_a_line() -> None:
     centres, scores = np.array([[0.5, -2.0, 1.625], [1.0, 0.0, 1.2]]), np.array([7.25, 3.0])
     shown = repr(Heads(centres, np.full((2, 4), np.nan), np.full(2, 0.1), scores))
     assert shown == "Heads(2: (0.50, -2.00, 1.62) m scores 7.2; (1.00, 0.00, 1.20) m scores 3.0)"
+
+
+@pytest.mark.parametrize("kind", [one for one in CLASSES if one not in (BadFrame, Intrinsics)])
+def test_what_holds_arrays_is_equal_to_itself_only(kind) -> None:
+    one, other = (kind(**{field.name: np.zeros((2, 3, 3)) for field in fields(kind)}) for _ in range(2))
+    assert one == one
+    assert one != other
+    assert len({one, other, one}) == 2
+    assert [other, one].index(one) == 1
+
+
+def test_what_holds_numbers_is_equal_to_its_like() -> None:
+    assert BadFrame(3, "torn") == BadFrame(3, "torn")
+    assert Intrinsics(4, 3, 2.0, 2.0, 1.0, 1.0) == Intrinsics(4, 3, 2.0, 2.0, 1.0, 1.0)

@@ -3,6 +3,8 @@
 Units are metres and nanoseconds. The world frame is right-handed with z up; camera frames are optical (x right,
 y down, z forward); a head frame is x out of the face, y to the person's left, z up through the crown.
 ``T_a_b`` is a 4x4 matrix that maps coordinates in b to coordinates in a.
+
+What holds arrays is equal to itself only, and may be in a set: compare the arrays.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ class Intrinsics:
     depth_scale: float = 0.001
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class DepthImage:
     """One depth image. ``depth`` is (height, width) uint16, C-contiguous; ``T_world_camera`` (4, 4) float64."""
 
@@ -47,7 +49,7 @@ class DepthImage:
     T_world_camera: F64
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
     """One point cloud.
 
@@ -61,7 +63,7 @@ class Cloud:
     T_world_sensor: F64 | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """What all sensors saw at one moment: ``clouds`` and ``depths``, either of which may be empty."""
 
@@ -89,7 +91,7 @@ def unknown(*shape: int) -> F64:
     return numbers
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Heads:
     """The heads found in one frame, as a structure of arrays, best score first.
 
@@ -137,7 +139,7 @@ class Heads:
         return f"Heads({len(self)}: {'; '.join(told)})" if told else "Heads(0)"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Expected:
     """Where heads are expected in the next frame, as a tracker predicts them: structure of arrays.
 
@@ -154,7 +156,7 @@ class Expected:
         return len(self.centres)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Head:
     """One row of :class:`Heads`."""
 
@@ -175,7 +177,7 @@ class State(IntEnum):
     """Confirmed, not seen in this frame: where it should be by now."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
     """The heads that are followed, at one moment: structure of arrays, those with an id first, in its order.
 
@@ -229,7 +231,7 @@ class Tracks:
         return (self[n] for n in range(len(self)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """A head as it is written: a row of :class:`Tracks`, or a bare head, without id (0), state and velocity (NaN).
 

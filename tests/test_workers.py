@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from headvox.config import DetectorConfig
-from headvox.errors import HeadvoxError, Undecided
+from headvox.errors import HeadvoxError
 from headvox.evaluate import scenarios as scenario
 from headvox.evaluate.match import Rules
 from headvox.evaluate.outcome import Outcome, Plan, evaluate_all, pooled
@@ -109,14 +109,6 @@ def test_a_scheduler_without_workers_and_workers_of_another_headvox_are_told(mon
         monkeypatch.setattr(cluster, "__version__", "9.9")
         with pytest.raises(HeadvoxError, match=r"this is headvox 9\.9, and there are workers with"):
             list(Workers(1, empty.scheduler_address).map(square, range(3)))
-
-
-def test_errors_survive_the_way_between_processes():
-    import pickle
-
-    for error in (HeadvoxError("what", "do"), Undecided("what", "do", ["a", "b"])):
-        again = pickle.loads(pickle.dumps(error))
-        assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))
 
 
 # ------------------------------------------------------------------------------------------ many recordings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 
 class HeadvoxError(Exception):
@@ -19,6 +20,15 @@ class HeadvoxError(Exception):
 
     def __str__(self) -> str:
         return f"{self.what} {self.do}".rstrip()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Say how another process makes it again: by what it holds, as kinds of errors are made from other things."""
+        return _again, (type(self), self.args), self.__dict__
+
+
+def _again(kind: type[HeadvoxError], args: tuple[Any, ...]) -> HeadvoxError:
+    """Return an error that is still to be told what it holds."""
+    return kind.__new__(kind, *args)
 
 
 class Undecided(HeadvoxError):

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ class Detector:
     """Finds heads in point clouds and depth images.
 
     A detector keeps its working memory between frames, so it is not for two threads at once: give each its own. A call
-    while another thread's is under way raises HeadvoxError.
+    while another thread's is under way raises HeadvoxError. A copy, or what was pickled, is made anew from ``config``.
     ``stage_ms`` holds what each stage of the last frame took. ``backend`` goes before that of ``config``; ``note`` is
     told what a user should know, by default as a Python warning.
 
@@ -93,6 +94,10 @@ class Detector:
         ):  # so that the first frame takes no longer than others: all regions have one shape
             self._memory_for(Frame(0))
         self._looked_at: tuple[Memory, I32, I64] | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Say how to make another one: working memory and threads are of this one."""
+        return partial(type(self), note=self._note), (self.config,)
 
     # ------------------------------------------------------------------------------------------- the public calls
 

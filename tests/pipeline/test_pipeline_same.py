@@ -1,5 +1,7 @@
 """The same heads whatever the threads, the frames before, and the place of the cloud."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -119,6 +121,20 @@ def test_two_cameras_of_one_name_are_two_cameras(make):
         wanted = everything(detector.detect_frame(frame))
         assert everything(detector.detect_frame(same)) == wanted
         assert everything(detector.detect_frame(same)) == wanted
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda detector: pickle.loads(pickle.dumps(detector))])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_copy_has_the_settings_and_nothing_else_of_the_detector(make, monkeypatch, threads, copied):
+    detector = make(min_score=-2.0, threads=threads)
+    monkeypatch.setattr(detector, "_note", print)
+    wanted = everything(detector.detect(two_busts()))
+    another = copied(detector)
+    detector.close()
+    assert (another.config, another._note) == (detector.config, print)
+    assert len(another.candidates_of_last_frame()[0]) == 0
+    assert everything(another.detect(two_busts())) == wanted
+    another.close()
 
 
 # ------------------------------------------------------------------------------------------------- where the cloud lies

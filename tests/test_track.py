@@ -182,6 +182,34 @@ def test_irregular_stamps_are_real_time() -> None:
     assert not tracker.untracked
 
 
+@pytest.mark.parametrize("stamp_ns", [np.nan, np.inf, 1.5, 2**62, -(2**63), 10**400, "1", None])
+def test_a_stamp_that_is_no_whole_nanoseconds_is_refused_by_all(stamp_ns) -> None:
+    tracker = Tracker()
+    for _ in range(2):
+        for call in (lambda: tracker.update(heads(), Frame(stamp_ns)), lambda: tracker.predict(stamp_ns),
+                     lambda: tracker.expected(stamp_ns)):  # fmt: skip
+            with pytest.raises(HeadvoxError, match="stamp_ns: expected whole nanoseconds, less than 2"):
+                call()
+        follow(tracker, walk(3))
+
+
+def test_stamps_may_be_any_kind_of_whole_number() -> None:
+    for kind in (int, float, np.int64, np.uint64):
+        tracker = Tracker()
+        for k in (1, 2, 3, 1):
+            tracks = tracker.update(heads(*STANDING), Frame(kind(k * 10**8)))
+        assert (tracks.stamp_ns, type(tracks.stamp_ns), tracker.untracked) == (10**8, int, {"late": 1})
+        assert tracker.predict(kind(4 * 10**8)).ids.tolist() == [1]
+
+
+def test_stamps_at_both_ends_of_time() -> None:
+    tracker = Tracker()
+    tracker.update(heads(*STANDING), Frame(1 - 2**62))
+    assert len(tracker.update(heads(), Frame(2**62 - 1))) == 0
+    follow(tracker, STANDING * 3)
+    assert len(tracker.predict(2**62 - 1)) == 1
+
+
 def test_repeated_and_late_frames_are_counted_and_change_nothing() -> None:
     tracker = Tracker()
     follow(tracker, STANDING * 10)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from headvox.data import F64, BadFrame, Frame
+from headvox.data import F64, BadFrame, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
+
+STAMP_LIMIT_NS = 2**62
+NUMBERS = (int, float, np.integer, np.floating)
 
 
 def origins_of(frame: Frame) -> F64:
@@ -26,11 +31,7 @@ def check_frame(frame: Frame | BadFrame) -> None:
     """Raise HeadvoxError where a reading has another shape or type than it should, or a place that is not rigid."""
     if isinstance(frame, BadFrame):
         raise HeadvoxError(f"There is nothing in a bad frame: {frame.reason}", "Leave it out.")
-    if not float(frame.stamp_ns).is_integer():
-        raise HeadvoxError(
-            f"stamp_ns: expected whole nanoseconds, got {frame.stamp_ns!r}.",
-            "Of seconds, take round(1e9 * seconds).",
-        )
+    as_stamp(frame.stamp_ns)
     if not frame.clouds and not frame.depths:
         raise HeadvoxError(
             "The frame has neither points nor depth images.", "Give at least one sensor's reading."
@@ -63,11 +64,30 @@ def check_frame(frame: Frame | BadFrame) -> None:
                 f"{camera.width}x{camera.height}.",
                 "Give the intrinsics of this image size.",
             )
-        if not (camera.fx > 0 and camera.fy > 0 and camera.depth_scale > 0):
-            raise HeadvoxError(
-                f"{image.name}: fx, fy and depth_scale must be above 0.", "Check the intrinsics."
-            )
+        _check_lens(camera, image.name)
         as_rigid(image.T_world_camera, f"{image.name}: T_world_camera")
+
+
+def as_stamp(stamp_ns: float) -> int:
+    """Return ``stamp_ns`` as a whole number.
+
+    Raises:
+        HeadvoxError: it is none, or so large that the time between two of them has no place in an int64.
+    """
+    if not (isinstance(stamp_ns, NUMBERS) and abs(stamp_ns) < STAMP_LIMIT_NS and stamp_ns == int(stamp_ns)):
+        raise HeadvoxError(
+            f"stamp_ns: expected whole nanoseconds, less than 2**62 (146 years), got {stamp_ns!r}.",
+            "Of seconds, take round(1e9 * seconds).",
+        )
+    return int(stamp_ns)
+
+
+def _check_lens(camera: Intrinsics, name: str) -> None:
+    for key in ("fx", "fy", "cx", "cy", "depth_scale"):
+        value, may_be_any = getattr(camera, key), key in ("cx", "cy")
+        if not (isinstance(value, NUMBERS) and math.isfinite(value) and (may_be_any or float(value) > 0)):
+            expected = "a finite number" if may_be_any else "a finite number above 0"
+            raise HeadvoxError(f"{name}: {key}: expected {expected}, got {value!r}.", "Check the intrinsics.")
 
 
 def nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:

@@ -94,9 +94,20 @@ def test_wrong_depth_images(make):
         (depth_image(full, width=4), "left: the image is 3x2, its camera 4x2"),
         (depth_image(full, height=3), "the image is 3x2, its camera 3x3"),
         (depth_image(np.empty((0, 3), np.uint16)), "the image is 3x0"),
-        (depth_image(full, fx=0.0), "fx, fy and depth_scale must be above 0"),
-        (depth_image(full, fy=float("nan")), "fx, fy and depth_scale"),
-        (depth_image(full, depth_scale=-0.001), "fx, fy and depth_scale"),
+        (depth_image(full, fx=0.0), r"left: fx: expected a finite number above 0, got 0\.0"),
+        (depth_image(full, fx=float("inf")), "left: fx: expected a finite number above 0, got inf"),
+        (depth_image(full, fy=float("nan")), "left: fy: expected a finite number above 0, got nan"),
+        (depth_image(full, fy="2"), "left: fy: expected a finite number above 0, got '2'"),
+        (depth_image(full, cx=float("nan")), "left: cx: expected a finite number, got nan"),
+        (depth_image(full, cy=float("-inf")), "left: cy: expected a finite number, got -inf"),
+        (
+            depth_image(full, depth_scale=-0.001),
+            r"depth_scale: expected a finite number above 0, got -0\.001",
+        ),
+        (
+            depth_image(full, depth_scale=float("inf")),
+            "depth_scale: expected a finite number above 0, got inf",
+        ),
         (depth_image(np.zeros((2, 3), np.uint16)), "left: the depth image has no return at all"),
         (depth_image(np.full((2, 3), 65535, np.uint16)), "left: no return is within 0.7 m"),
     ]:
@@ -141,8 +152,9 @@ def test_heads_are_rows_of_their_arrays(make):
 def test_a_frame_that_is_none(make):
     with pytest.raises(HeadvoxError, match=r"nothing in a bad frame: damaged\. Leave it out"):
         make().detect_frame(BadFrame(0, "damaged."))
-    with pytest.raises(HeadvoxError, match=r"expected whole nanoseconds, got 1\.5"):
-        make().detect_frame(Frame(1.5, clouds=(Cloud("c", two_busts()),)))
+    for stamp_ns in (1.5, float("nan"), 2**63, None):
+        with pytest.raises(HeadvoxError, match=r"stamp_ns: expected whole nanoseconds, .* got "):
+            make().detect_frame(Frame(stamp_ns, clouds=(Cloud("c", two_busts()),)))
 
 
 def test_a_second_thread_is_refused_in_the_midst_of_a_frame_and_the_first_goes_on(make, monkeypatch):

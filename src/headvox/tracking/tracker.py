@@ -13,6 +13,7 @@ from collections import Counter
 
 import numpy as np
 
+from headvox.check import as_stamp
 from headvox.config import TrackerConfig, given_or_default
 from headvox.data import F64, I64, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
@@ -83,19 +84,24 @@ class Tracker:
 
         The images of the frame tell where a head that was not found may be hidden; a frame without any will do. A
         frame whose stamp is not after the last one's is not tracked: its heads come back as tentative tracks.
+
+        Raises:
+            HeadvoxError: a stamp that is not in whole nanoseconds.
         """
+        stamp_ns = as_stamp(frame.stamp_ns)
         with self._turns:
-            if not self._is_next(frame.stamp_ns):
-                return tentative(heads, frame.stamp_ns)
-            self._take(heads, frame)
-            return report(self._roster, frame.stamp_ns, frame.stamp_ns)
+            if not self._is_next(stamp_ns):
+                return tentative(heads, stamp_ns)
+            self._take(heads, frame, stamp_ns)
+            return report(self._roster, stamp_ns, stamp_ns)
 
     def predict(self, stamp_ns: int) -> Tracks:
         """Return where the tracks will be at a stamp that is not before the last frame's; nothing is changed.
 
         Raises:
-            HeadvoxError: an earlier stamp.
+            HeadvoxError: an earlier stamp, or one that is not in whole nanoseconds.
         """
+        stamp_ns = as_stamp(stamp_ns)
         with self._turns:
             if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
                 raise HeadvoxError(
@@ -106,7 +112,12 @@ class Tracker:
             return report(self._predicted(stamp_ns), last_ns, stamp_ns)
 
     def expected(self, stamp_ns: int) -> Expected:
-        """Return where confirmed heads are expected at ``stamp_ns``, for :meth:`Detector.detect_frame`."""
+        """Return where confirmed heads are expected at ``stamp_ns``, for :meth:`Detector.detect_frame`.
+
+        Raises:
+            HeadvoxError: a stamp that is not in whole nanoseconds.
+        """
+        stamp_ns = as_stamp(stamp_ns)
         with self._turns:
             if self.stamp_ns is None or stamp_ns < self.stamp_ns:
                 return Expected(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
@@ -119,14 +130,14 @@ class Tracker:
 
     # -------------------------------------------------------------------------------------------------- the steps
 
-    def _take(self, heads: Heads, frame: Frame) -> None:
+    def _take(self, heads: Heads, frame: Frame, stamp_ns: int) -> None:
         """Go through the five steps with a frame that is after the last one."""
         R_centre, R_turn = measurement_noise(heads, frame)
-        before_ns = frame.stamp_ns if self.stamp_ns is None else self.stamp_ns
-        self._predict(before_ns, frame.stamp_ns)
+        before_ns = stamp_ns if self.stamp_ns is None else self.stamp_ns
+        self._predict(before_ns, stamp_ns)
         tracks, found = self._associate(heads, R_centre)
         self._correct(heads, R_centre, R_turn, tracks, found)
-        self._age(heads.centres, frame, (frame.stamp_ns - before_ns) * 1e-9)
+        self._age(heads.centres, frame, (stamp_ns - before_ns) * 1e-9)
         new = heads.sure.copy()
         new[found] = False
         self._bear(heads, R_centre, R_turn, np.flatnonzero(new))

@@ -43,7 +43,9 @@ def changed(row, column, value):
     [
         (np.eye(3), r"expected a 4x4 matrix, got shape \(3, 3\)"),
         ("north", "expected a 4x4 matrix"),
-        ([[1, 2], [3]], "expected a 4x4 matrix of numbers"),
+        (np.eye(4) + 1j, "expected a 4x4 matrix of real numbers"),
+        (np.ma.array(np.eye(4), mask=np.eye(4)), "expected a 4x4 matrix of real numbers"),
+        ([[1, 2], [3]], "expected a 4x4 matrix of real numbers"),
         (None, "expected a 4x4 matrix"),
         (changed(0, 3, np.nan), "NaN or infinite"),
         (changed(0, 0, np.inf), "NaN or infinite"),

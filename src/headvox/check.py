@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 
 import numpy as np
 
-from headvox.data import F64, BadFrame, Frame, Intrinsics
+from headvox.data import F64, BadFrame, Cloud, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
@@ -31,41 +32,82 @@ def check_frame(frame: Frame | BadFrame) -> None:
     """Raise HeadvoxError where a reading has another shape or type than it should, or a place that is not rigid."""
     if isinstance(frame, BadFrame):
         raise HeadvoxError(f"There is nothing in a bad frame: {frame.reason}", "Leave it out.")
+    _check_kind(frame, Frame, "detect_frame")
     as_stamp(frame.stamp_ns)
+    _check_readings(frame.clouds, Cloud, "clouds")
+    _check_readings(frame.depths, DepthImage, "depths")
     if not frame.clouds and not frame.depths:
         raise HeadvoxError(
             "The frame has neither points nor depth images.", "Give at least one sensor's reading."
         )
     for cloud in frame.clouds:
-        points = cloud.points
-        if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
-            shape = getattr(points, "shape", type(points).__name__)
-            raise HeadvoxError(
-                f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them."
-            )
-        if points.dtype != np.float32 or not points.flags.c_contiguous:
-            raise HeadvoxError(
-                f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype} in strides {points.strides}.",
-                "Use np.ascontiguousarray(points, dtype=np.float32).",
-            )
-        if len(points) == 0:
-            raise HeadvoxError(f"{cloud.name}: the cloud is empty.", "Is the sensor running?")
-        if cloud.T_world_sensor is not None:
-            as_rigid(cloud.T_world_sensor, f"{cloud.name}: T_world_sensor")
+        _check_cloud(cloud)
     for image in frame.depths:
-        depth, camera = image.depth, image.intrinsics
-        if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
-            got = f"{getattr(depth, 'dtype', type(depth).__name__)} {getattr(depth, 'shape', '')}"
-            expected = "expected a (height, width) uint16 depth image"
-            raise HeadvoxError(f"{image.name}: {expected}, got {got}.", "Convert it.")
-        if depth.size == 0 or depth.shape != (camera.height, camera.width):
-            raise HeadvoxError(
-                f"{image.name}: the image is {depth.shape[1]}x{depth.shape[0]}, its camera "
-                f"{camera.width}x{camera.height}.",
-                "Give the intrinsics of this image size.",
-            )
-        _check_lens(camera, image.name)
-        as_rigid(image.T_world_camera, f"{image.name}: T_world_camera")
+        _check_image(image)
+
+
+def _check_readings(readings: object, kind: type, name: str) -> None:
+    if not isinstance(readings, (tuple, list)):
+        got = f"expected a tuple of {kind.__name__}, got {type(readings).__name__}"
+        raise HeadvoxError(f"{name} of the frame: {got}.", f"Write {name}=(reading,).")
+    for reading in readings:
+        _check_kind(reading, kind, f"{name} of the frame")
+
+
+def _check_kind(thing: object, kind: type, where: str) -> None:
+    if not isinstance(thing, kind):
+        made = f"{kind.__name__}({', '.join(field.name for field in fields(kind))})"
+        raise HeadvoxError(
+            f"{where}: expected headvox.{kind.__name__}, got {type(thing).__name__}.",
+            f"Make it by headvox.{made}.",
+        )
+
+
+def _check_unmasked(array: object, name: str, invalid: str) -> None:
+    if isinstance(array, np.ma.MaskedArray):
+        raise HeadvoxError(f"{name}: expected a plain array, got a masked one.", f"Take .filled({invalid}).")
+
+
+def _check_place(T: object, name: str) -> None:
+    if not isinstance(T, np.ndarray):
+        what = f"{name}: expected an array of shape (4, 4), got {type(T).__name__}."
+        raise HeadvoxError(what, "Use np.array(T, dtype=np.float64).")
+    as_rigid(T, name)
+
+
+def _check_cloud(cloud: Cloud) -> None:
+    points = cloud.points
+    _check_unmasked(points, cloud.name, "np.nan")
+    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
+        shape = getattr(points, "shape", type(points).__name__)
+        raise HeadvoxError(f"{cloud.name}: expected points of shape (N, 3), got {shape}.", "Reshape them.")
+    if points.dtype != np.float32 or not points.flags.c_contiguous:
+        raise HeadvoxError(
+            f"{cloud.name}: expected C-contiguous float32 points, got {points.dtype} in strides {points.strides}.",
+            "Use np.ascontiguousarray(points, dtype=np.float32).",
+        )
+    if len(points) == 0:
+        raise HeadvoxError(f"{cloud.name}: the cloud is empty.", "Is the sensor running?")
+    if cloud.T_world_sensor is not None:
+        _check_place(cloud.T_world_sensor, f"{cloud.name}: T_world_sensor")
+
+
+def _check_image(image: DepthImage) -> None:
+    depth, camera = image.depth, image.intrinsics
+    _check_unmasked(depth, image.name, "0")
+    if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
+        got = f"{getattr(depth, 'dtype', type(depth).__name__)} {getattr(depth, 'shape', '')}"
+        expected = "expected a (height, width) uint16 depth image"
+        raise HeadvoxError(f"{image.name}: {expected}, got {got}.", "Convert it.")
+    _check_kind(camera, Intrinsics, f"{image.name}: intrinsics")
+    if depth.size == 0 or depth.shape != (camera.height, camera.width):
+        raise HeadvoxError(
+            f"{image.name}: the image is {depth.shape[1]}x{depth.shape[0]}, its camera "
+            f"{camera.width}x{camera.height}.",
+            "Give the intrinsics of this image size.",
+        )
+    _check_lens(camera, image.name)
+    _check_place(image.T_world_camera, f"{image.name}: T_world_camera")
 
 
 def as_stamp(stamp_ns: float) -> int:

@@ -26,10 +26,13 @@ def as_rigid(matrix: npt.ArrayLike, name: str) -> F64:
             rotation (scaled, sheared, mirrored or singular).
     """
     try:
-        T = np.asarray(matrix, dtype=np.float64)
+        given = np.asanyarray(matrix)
+        if given.dtype.kind == "c" or isinstance(given, np.ma.MaskedArray):
+            raise TypeError  # NumPy would leave out what is imaginary, and take what is masked
+        T = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise HeadvoxError(
-            f"{name}: expected a 4x4 matrix of numbers.", "Give four rows of four numbers."
+            f"{name}: expected a 4x4 matrix of real numbers.", "Give four rows of four numbers."
         ) from None
     if T.shape != (4, 4):
         raise HeadvoxError(

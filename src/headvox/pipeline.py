@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -119,7 +120,7 @@ class Detector:
             HeadvoxError: an image that does not fit its camera, a transform that is not rigid, or no return in range.
         """
         return self.detect_frame(
-            Frame(0, depths=(images,) if isinstance(images, DepthImage) else tuple(images))
+            Frame(0, depths=tuple(images) if isinstance(images, Sequence) else (images,))
         )
 
     def detect_frame(self, frame: Frame, expected: Expected | None = None) -> Heads:
@@ -134,15 +135,17 @@ class Detector:
             with self._threads.awake():
                 return self._detect(frame, expected)
 
-    def detect_batch(self, frames: Sequence[Frame]) -> list[Heads]:
+    def detect_batch(self, frames: Iterable[Frame]) -> list[Heads]:
         """Return the heads in each of ``frames``, as :meth:`detect_frame` does; on a GPU, several go at once.
 
         Raises:
             HeadvoxError: as :meth:`detect_frame`; of several, the first.
         """
-        parts = [frames[first : first + BATCH] for first in range(0, len(frames), BATCH)]
+        found, left = [], iter(frames)
         with self._alone:
-            return [heads for part in parts for heads in self._detect_together(part, [None] * len(part))]
+            while part := list(islice(left, BATCH)):
+                found += self._detect_together(part, [None] * len(part))
+        return found
 
     def candidates_of_last_frame(self) -> tuple[F64, F64]:
         """Return what passed the gate of the last frame, and what the second stage gave it; for pictures and tuning.

@@ -157,6 +157,59 @@ def test_a_frame_that_is_none(make):
             make().detect_frame(Frame(stamp_ns, clouds=(Cloud("c", two_busts()),)))
 
 
+def test_a_reading_of_another_kind_is_told_with_what_makes_one(make):
+    detector, points, image = make(), two_busts(), depth_image(np.full((2, 3), 500, np.uint16))
+    cloud = Cloud("c", points)
+    for call, told in [
+        (lambda: detector.detect_frame(None), r"headvox\.Frame, got NoneType\. Make it by headvox\.Frame\(stamp_ns, "),
+        (lambda: detector.detect_batch([image]), "detect_frame: expected headvox.Frame, got DepthImage"),
+        (lambda: detector.detect_depth(image.depth), r"got ndarray\. Make it by headvox\.DepthImage\(name, depth, "),
+        (lambda: detector.detect_depth([image.depth]), "depths of the frame: expected headvox.DepthImage, got ndarray"),
+        (lambda: detector.detect_depth(None), "expected headvox.DepthImage, got NoneType"),
+        (lambda: detector.detect_frame(Frame(0, (points,))), "clouds of the frame: expected headvox.Cloud, got nd"),
+        (lambda: detector.detect_frame(Frame(0, cloud)), r"tuple of Cloud, got Cloud\. Write clouds=\(reading,\)"),
+        (lambda: detector.detect_frame(Frame(0, depths=image)), "expected a tuple of DepthImage, got DepthImage"),
+        (lambda: detector.detect_frame(Frame(0, None)), "expected a tuple of Cloud, got NoneType"),
+        (lambda: detector.detect_depth(replace(image, intrinsics=(3, 2))), "expected headvox.Intrinsics, got tuple"),
+        (lambda: detector.detect_depth(replace(image, T_world_camera=np.eye(4).tolist())), "got list"),
+        (lambda: detector.detect_frame(Frame(0, (Cloud("c", points, np.eye(4).tolist()),))), "got list"),
+    ]:  # fmt: skip
+        with pytest.raises(HeadvoxError, match=told) as error:
+            call()
+        assert error.value.do
+
+
+def test_what_is_masked_or_imaginary_is_not_passed_over(make):
+    points, image = two_busts(), depth_image(np.full((2, 3), 500, np.uint16))
+    with pytest.raises(HeadvoxError, match=r"points: .* got a masked one\. Take \.filled\(np\.nan\)"):
+        make().detect(np.ma.array(points, mask=points > 0))
+    with pytest.raises(HeadvoxError, match=r"left: .* got a masked one\. Take \.filled\(0\)"):
+        make().detect_depth(replace(image, depth=np.ma.array(image.depth)))
+    with pytest.raises(HeadvoxError, match="left: T_world_camera: expected a 4x4 matrix of real numbers"):
+        make().detect_depth(replace(image, T_world_camera=np.eye(4) + 0j))
+
+
+def test_many_frames_may_come_one_by_one(make):
+    detector = make(min_score=-2.0)
+    frames = [camera_frame(k) for k in range(3)] * 4
+    wanted = [everything(detector.detect_frame(frame)) for frame in frames]
+    assert [everything(heads) for heads in detector.detect_batch(iter(frames))] == wanted
+    assert detector.detect_batch(iter([])) == []
+
+
+def test_a_place_of_other_numbers_is_the_same_place(make):
+    frame = camera_frame()
+    T = np.round(frame.depths[0].T_world_camera)
+    for kind in (np.float32, np.int64):
+        found = [
+            make(min_score=-2.0).detect_frame(
+                Frame(0, depths=(replace(frame.depths[0], T_world_camera=one),))
+            )
+            for one in (T, T.astype(kind))
+        ]
+        assert everything(found[0]) == everything(found[1])
+
+
 def test_a_second_thread_is_refused_in_the_midst_of_a_frame_and_the_first_goes_on(make, monkeypatch):
     detector, frame = make(min_score=-2.0), Frame(0, clouds=(Cloud("c", two_busts()),))
     wanted, gate, refused = everything(detector.detect_frame(frame)), detector._gate, []

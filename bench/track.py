@@ -18,7 +18,7 @@ each kind of crowd:
     lag           how many frames the track of a walking head is behind
     ms            a frame, median
 
-Measure real frames with `headvox run RECORDING --json > found.jsonl; headvox eval RECORDING --found found.jsonl`.
+Measure real frames with `headvox run RECORDING --json > found.jsonl; headvox eval RECORDING --heads found.jsonl`.
 """
 
 from __future__ import annotations

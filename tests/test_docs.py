@@ -6,6 +6,7 @@ The commands of a document run in its order in one folder that holds what README
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shlex
@@ -29,6 +30,7 @@ else:
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PROGRAMS = sorted(path for kind in ("bench", "examples", "tools") for path in (ROOT / kind).rglob("*.py"))
 SAMPLE = Path(headvox.__file__).parent / "assets" / "sample"
 INSTALL = re.compile(r"pip install -e (?:\.|'\.\[([a-z,]+)\]')")
 # What these do is done already, or is going on: the tests look at what they name instead.
@@ -75,6 +77,19 @@ def other_commands(document: Path) -> list[str]:
     lines = text.replace("\\\n", " ").splitlines()
     bare = [command for line in lines if (command := re.sub(r"(^|\s+)#.*", "", line))]
     return [command for line in bare for command in line.split(" && ")]
+
+
+def spans(text: str) -> list[str]:
+    """Return what stands between backticks, the commands of a line each by itself."""
+    return [part for span in re.findall(r"`([^`\n]+)`", text) for part in span.split("; ")]
+
+
+def docstring(program: Path) -> str:
+    return ast.get_docstring(ast.parse(program.read_text("utf-8"))) or ""
+
+
+def flags_in(text: str) -> set[str]:
+    return set(re.findall(r"(?<=[ \[])--[a-z][a-z-]*", text))
 
 
 def reason_not_to_run(command: str) -> str | None:
@@ -136,22 +151,33 @@ def test_every_flag_in_the_documents_is_one(capsys: pytest.CaptureFixture[str]) 
         return set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out))
 
     told: dict[tuple[str, ...], set[str]] = {("run",): flags_of("run")}
+    texts = {program: spans(docstring(program)) for program in PROGRAMS}
     for document in DOCUMENTS:
-        spans = re.findall(
-            r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", document.read_text("utf-8"), flags=re.M | re.S)
-        )
-        for text in [*commands(document), *other_commands(document), *spans]:
+        prose = re.sub(r"^```.*?^```$", "", document.read_text("utf-8"), flags=re.M | re.S)
+        texts[document] = [*commands(document), *other_commands(document), *spans(prose)]
+    for document, told_there in texts.items():
+        for text in told_there:
             if not (match := re.match(r"headvox ([a-z]+)((?: [a-z-]+)?)(?=$|\s)", text)):
                 continue
             words = (match[1], *match[2].split()) if match[1] in ("masks", "synth") else (match[1],)
             if words not in told:
                 told[words] = flags_of(*words)
-            assert set(re.findall(r"(?<= )--[a-z][a-z-]*", text)) <= told[words], (document.name, text)
+            assert flags_in(text) <= told[words], (document.name, text)
     told[("bag",)] = flags_of("masks", "evolve") | flags_of("eval") | flags_of("align")
     known = set.union(*told.values())
     for document in DOCUMENTS:
         for flag in re.findall(r"`(--[a-z][a-z-]*)[^`\n]*`", document.read_text("utf-8")):
             assert flag in known, (document.name, flag)
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.name)
+def test_every_flag_that_a_program_tells_of_itself_is_one(program: Path) -> None:
+    name, source = program.relative_to(ROOT).as_posix(), program.read_text("utf-8")
+    usage = re.findall(rf"^ *python {re.escape(name)} .*", docstring(program), re.MULTILINE)
+    known = set(re.findall(r'"(--[a-z][a-z-]*)"', source))
+    if "import Workers, add_flags" in source:
+        known |= {"--workers", "--scheduler"}
+    assert flags_in(" ".join(usage)) <= known
 
 
 def test_the_readme_sets_up_what_the_gate_does() -> None:

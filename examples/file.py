@@ -22,7 +22,7 @@ def main(place: str | Path) -> None:
                 continue
             heads = detector.detect_frame(frame, tracker.expected(frame.stamp_ns))
             for track in tracker.update(heads, frame):
-                if track.id:  # 0 until it was seen in three frames of five
+                if track.id:  # 0 until it was seen often enough to be believed
                     x, y, z = track.centre
                     print(f"{frame.stamp_ns / 1e9:.3f} s  head {track.id}  {x:+.3f} {y:+.3f} {z:+.3f} m")
 

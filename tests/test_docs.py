@@ -212,7 +212,9 @@ def test_every_piece_of_python_runs(
     for piece in pieces:
         assert len(piece.splitlines()) <= 10
         exec(compile(piece, "README.md", "exec"), names)
-        assert capsys.readouterr().out.strip()
+        told = capsys.readouterr().out
+        assert told.strip()
+        assert "head 0" not in told  # what has no id yet is not a head that anybody should be told of
     assert len(names["heads"]) == len(names["heads"].centres)
 
 

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from importlib.metadata import metadata
+from pathlib import Path
 
 import pytest
 
@@ -57,6 +58,24 @@ def test_looking_for_it_imports_nothing_heavy() -> None:
     script += "print(*{'numba', 'rerun', 'rclpy', 'pyrealsense2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_an_extra_is_there_when_all_of_its_packages_are(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    packages = [f"of_the_test.{name}" for name in ("compiler", "loader")]
+    told = doctor._extra("cuda", ("json", *packages)).told
+    assert told == "no of_the_test.compiler, of_the_test.loader: pip install 'headvox[cuda]'"
+    (tmp_path / "of_the_test" / "compiler").mkdir(parents=True)
+    assert doctor._extra("cuda", ("json", *packages)).told.startswith("no of_the_test.loader:")
+    (tmp_path / "of_the_test" / "loader").mkdir()
+    assert doctor._extra("cuda", ("json", *packages)).told == "installed"
+
+
+def test_numba_cuda_alone_is_not_the_extra() -> None:
+    """It comes with ``dev``, too, without NVIDIA's compiler."""
+    assert {"nvidia.cuda_nvcc", "nvidia.cuda_nvrtc"} < set(doctor.EXTRAS["cuda"])
 
 
 def test_every_extra_for_users_is_looked_for() -> None:

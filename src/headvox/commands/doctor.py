@@ -31,7 +31,7 @@ EXTRAS = {
     "evolve": ("lightgbm", "cmaes"),
     "cluster": ("distributed", "fsspec"),
     "realsense": ("pyrealsense2",),
-    "cuda": ("numba_cuda",),
+    "cuda": ("numba_cuda", "nvidia.cuda_nvcc", "nvidia.cuda_nvrtc"),
     "completion": ("shtab",),
     "sim": ("mujoco",),
 }
@@ -155,9 +155,16 @@ def _ros() -> Check:
 
 
 def _extra(name: str, modules: tuple[str, ...]) -> Check:
-    missing = [module for module in modules if importlib.util.find_spec(module) is None]
+    missing = [module for module in modules if not _is_there(module)]
     told = "installed" if not missing else f"no {', '.join(missing)}: pip install 'headvox[{name}]'"
     return Check(f"extra {name}", told)
+
+
+def _is_there(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # not even the package that it is in
+        return False
 
 
 def _detection() -> Check:

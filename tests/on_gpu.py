@@ -24,6 +24,7 @@ from gpu_arrays import (
     zeros,
 )
 from numba import cuda
+from votes import score_by_votes
 
 from headvox import Cloud, DepthImage, Frame, Intrinsics
 from headvox.cuda import (
@@ -43,7 +44,7 @@ from headvox.masks.compile import compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade
 from headvox.suppress import suppress as suppress_on_cpu
 from headvox.visibility import cells_of, count_seen
-from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes
+from headvox.vote import DROPPED, score_by_stages, seen_boxes
 from headvox.voxelize import Lattice, Rays, voxelize_depth, voxelize_points
 
 # The simulator computes as NumPy's scalars do, which tell of what the hardware does silently.

@@ -3,7 +3,7 @@ from dataclasses import fields, replace
 
 import pytest
 
-from headvox.config import DetectorConfig, from_mapping, load_config, to_toml
+from headvox.config import DetectorConfig, load_config, to_toml
 from headvox.errors import HeadvoxError
 from headvox.pipeline import Detector
 from headvox.tracking.tracker import Tracker
@@ -109,12 +109,6 @@ def test_a_missing_file(tmp_path):
 def test_a_bad_setting_made_in_python(setting, told):
     with pytest.raises(HeadvoxError, match=told):
         DetectorConfig(**setting)
-
-
-def test_from_mapping_names_its_origin():
-    with pytest.raises(HeadvoxError, match=r"^flags: unknown setting 'x'"):
-        from_mapping({"x": 1}, "flags")
-    assert from_mapping({"centre": [1, 2, 3]}, "flags").centre == (1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize("make", [Detector, Tracker])

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import scenes
 from test_gate import random_cells
+from votes import score_by_votes
 
 from headvox.integral import integral_volume
 from headvox.machine.simd import LANES
 from headvox.masks.cascade import Stage
 from headvox.masks.compile import compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade, shipped_cascades
-from headvox.vote import DROPPED, score_by_stages, score_by_votes, seen_boxes, statistics_of
+from headvox.vote import DROPPED, score_by_stages, seen_boxes, statistics_of
 
 SMALL = parse_cascade(scenes.STAGES, "small")
 SMALL_VOTES = parse_cascade(scenes.VOTES, "small votes")

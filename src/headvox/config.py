@@ -192,12 +192,8 @@ def _load(path: str | Path, kind: type[Config]) -> Config:
     return _over_defaults(kind, values, str(path))
 
 
-def from_mapping(values: dict[str, Any], origin: str) -> DetectorConfig:
-    """Return a configuration with ``values`` over the defaults; ``origin`` names them in errors."""
-    return _over_defaults(DetectorConfig, values, origin)
-
-
 def _over_defaults(kind: type[Config], values: dict[str, Any], origin: str) -> Config:
+    """Return a configuration with ``values`` over the defaults; ``origin`` names them in errors."""
     known = {field.name for field in fields(kind)}
     for key in values:
         if key not in known:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.machine.kernels import bare_kernel, kernel, rule
+from headvox.machine.kernels import bare_kernel, rule
 from headvox.machine.simd import (
     LANES,
     add,
@@ -195,21 +195,6 @@ def in_order(S: Integral) -> Integral:
 def in_halves(S: Integral) -> Integral:
     """Return a copy of ``S``, whose columns are in the order of z and of even length, with columns in halves."""
     return np.concatenate([S[:, :, 0::2], S[:, :, 1::2]], axis=2)
-
-
-@kernel
-def _box_sums(S, boxes, out):
-    mask = np.uint32(0xFFFF) if S.itemsize == 2 else np.uint32(0xFFFFFFFF)
-    for i in range(boxes.shape[0]):
-        b = boxes[i]
-        out[i] = np.uint32(box_sum(S, b[0], b[1], b[2], b[3], b[4], b[5])) & mask
-
-
-def box_sums(S: Integral, boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
-    """Return the sums (B,) over ``boxes`` (B, 6): x0 x1 y0 y1 z0 z1, half-open, cut off at the edges of the grid."""
-    out = np.empty(len(boxes), dtype=np.uint32)
-    _box_sums(S, np.ascontiguousarray(boxes, dtype=np.int64), out)
-    return out
 
 
 def box_reach(boxes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:

@@ -20,7 +20,7 @@ from headvox.integral import Integral, box_reach, place, set_corners, with_margi
 from headvox.machine.kernels import bare_kernel, kernel, product, rule
 from headvox.machine.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
 from headvox.masks.cascade import STATISTICS
-from headvox.masks.compile import SCORE_UNIT, CompiledStages, CompiledVotes
+from headvox.masks.compile import SCORE_UNIT, CompiledStages
 from headvox.slabs import ONE_SLAB, slice_of
 
 DROPPED = -(1 << 40)
@@ -48,7 +48,11 @@ def sum_in_halves(S, x, y, z, box):
 
 @rule
 def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes):
-    """Return the score of the voxel x, y, z, and its best yaw or -1: see :func:`score_by_votes`."""
+    """Return the score of the voxel x, y, z, in units of 1/1024, and its best yaw or -1 (paper, section 5).
+
+    score = sum over masks of sign(weighted sum) - cost * asymmetry, the asymmetry being the mean over the mirrored
+    pairs of \\|a - b\\| / (a + b). With too few positive votes at every yaw it is DROPPED.
+    """
     best = -np.inf
     best_yaw = -1
     for yaw in range(pairs.shape[0]):
@@ -81,38 +85,15 @@ def votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes):
 def vote_masks(
     S, seams, overlap, cells, first, last, boxes, weights, start, masks, pairs, cost, min_votes, scores, best_yaw,
 ):  # fmt: skip
-    """Score the candidates ``first`` to ``last`` of ``cells``: see :func:`score_by_votes`.
+    """Score the candidates ``first`` to ``last`` of ``cells``: see :func:`votes_at`.
 
-    S is in halves and in slabs (:mod:`headvox.slabs`).
+    A candidate that is dropped keeps the yaw that it had. S is in halves and in slabs (:mod:`headvox.slabs`).
     """
     for i in range(first, last):
         x, y, z = slice_of(cells[i, 0], seams, overlap), cells[i, 1], cells[i, 2]
         scores[i], yaw = votes_at(S, x, y, z, boxes, weights, start, masks, pairs, cost, min_votes)
         if yaw >= 0:
             best_yaw[i] = yaw
-
-
-def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, I32]:
-    """Return each candidate's score, in units of 1/1024, and the index of its best yaw (paper, section 5).
-
-    score = sum over masks of sign(weighted sum) - cost * asymmetry, the asymmetry being the mean over the mirrored
-    pairs of \\|a - b\\| / (a + b). Candidates with too few positive votes at every yaw get DROPPED.
-    """
-    scores = np.empty(len(cells), np.int64)
-    best_yaw = np.zeros(len(cells), np.int32)
-    table = (
-        votes.boxes,
-        votes.weights,
-        votes.start,
-        votes.masks,
-        votes.pairs,
-        votes.asymmetry_cost,
-        votes.min_votes,
-    )
-    reach = box_reach(np.concatenate([votes.boxes, votes.pairs.reshape(-1, 6)]))
-    S, cells = with_margins(S, reach), cells - reach[0::2].astype(np.int32)
-    vote_masks(S, *ONE_SLAB, cells, 0, len(cells), *table, scores, best_yaw)
-    return scores, best_yaw
 
 
 # ---------------------------------------------------------------------------------------------------- boosted

@@ -30,7 +30,7 @@ _votes_at = on_device(votes_at, sum_in_halves=sum_about_voxel, product=product_6
 
 @kernel
 def vote_masks(S, places, counts, which, table, masks, cost, min_votes, scores, yaws):
-    """Write the votes for each candidate, and its best yaw: see :func:`headvox.vote.score_by_votes`.
+    """Write the votes for each candidate, and its best yaw: see :func:`headvox.vote.votes_at`.
 
     ``places`` (frames, N) are the candidates, ``counts[:, which]`` of them in each frame; ``table`` is that of
     :func:`votes_table`.

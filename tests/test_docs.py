@@ -226,6 +226,15 @@ def test_python_that_needs_a_cluster_is_python() -> None:
         compile(piece, "scale.md", "exec")
 
 
+def test_a_source_distribution_holds_what_tests_and_documents_name() -> None:
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]
+    held = set(tools["hatch"]["build"]["targets"]["sdist"]["include"])
+    named = {ROOT / path for path in tools["pytest"]["ini_options"]["testpaths"]}
+    named |= {ROOT / ".ci" / "run", ROOT / "LICENSE", *DOCUMENTS, *PROGRAMS}
+    assert {path.relative_to(ROOT).parts[0] for path in named} <= held
+    assert all((ROOT / name).exists() for name in held)
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_link_leads_somewhere(document: Path) -> None:
     text = document.read_text("utf-8")

@@ -27,7 +27,8 @@ U16 = npt.NDArray[np.uint16]
 class Intrinsics:
     """A pinhole depth camera without distortion.
 
-    ``fx fy cx cy`` are in pixels, pixel centres at whole numbers; metres = value * ``depth_scale``, 0 = no return.
+    ``width height fx fy cx cy`` are in pixels, pixel centres at whole numbers; metres along the optical axis = value *
+    ``depth_scale``, 0 = no return.
     """
 
     width: int
@@ -41,7 +42,11 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthImage:
-    """One depth image. ``depth`` is (height, width) uint16, C-contiguous; ``T_world_camera`` (4, 4) float64."""
+    """One depth image.
+
+    ``name`` is what errors call the camera. ``depth`` is (height, width) uint16, C-contiguous, in units of the camera's
+    ``depth_scale``; ``T_world_camera`` (4, 4) float64, rigid, places the camera's optical frame in the world.
+    """
 
     name: str
     depth: U16
@@ -53,9 +58,9 @@ class DepthImage:
 class Cloud:
     """One point cloud.
 
-    ``points`` is (N, 3) float32 in metres, C-contiguous, invalid points NaN. ``T_world_sensor`` is (4, 4) float64
-    and places the sensor's frame in the world; ``None`` says that the points are world coordinates already and that
-    nobody knows where the sensor stood.
+    ``name`` is what errors call the sensor. ``points`` is (N, 3) float32 in metres, C-contiguous, invalid points NaN.
+    ``T_world_sensor`` is (4, 4) float64, rigid, and places the sensor's frame in the world; ``None`` says that the
+    points are world coordinates already and that nobody knows where the sensor stood.
     """
 
     name: str
@@ -65,7 +70,10 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """What all sensors saw at one moment: ``clouds`` and ``depths``, either of which may be empty."""
+    """What all sensors saw at one moment: ``clouds`` and ``depths``, either of which may be empty, but not both.
+
+    ``stamp_ns`` is the moment in whole nanoseconds of any clock that goes on evenly, less than 2**62 (146 years).
+    """
 
     stamp_ns: int
     clouds: tuple[Cloud, ...] = ()
@@ -74,7 +82,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class BadFrame:
-    """A frame that a source could not read; the run reports and counts it, and goes on."""
+    """A frame that a source could not read, and the ``reason``; the run reports and counts it, and goes on."""
 
     stamp_ns: int
     reason: str
@@ -158,7 +166,7 @@ class Expected:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Head:
-    """One row of :class:`Heads`."""
+    """One row of :class:`Heads`: ``centre`` (3,) and ``radius`` in metres, ``quaternion`` (4,) x y z w."""
 
     centre: F64
     quaternion: F64

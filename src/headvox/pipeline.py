@@ -61,6 +61,9 @@ class Detector:
     ``stage_ms`` holds what each stage of the last frame took. ``backend`` goes before that of ``config``; ``note`` is
     told what a user should know, by default as a Python warning.
 
+    Raises:
+        HeadvoxError: a cascade that is not there or cannot be read, or a back end that this machine has not.
+
     >>> import numpy as np
     >>> detector = Detector()
     >>> len(detector.detect(np.random.default_rng(0).uniform(-1, 1, (100, 3)).astype(np.float32)))
@@ -128,6 +131,10 @@ class Detector:
 
         Within the reach of where a head is ``expected``, one that scores a little too low (``score_slack``) is kept
         too, and marked as not sure.
+
+        Raises:
+            HeadvoxError: no reading, or one of the wrong shape or dtype, a transform that is not rigid, intrinsics or a
+                stamp that are no numbers, or nothing within range.
         """
         with self._alone:
             if self.on_device:
@@ -139,7 +146,7 @@ class Detector:
         """Return the heads in each of ``frames``, as :meth:`detect_frame` does; on a GPU, several go at once.
 
         Raises:
-            HeadvoxError: as :meth:`detect_frame`; of several, the first.
+            HeadvoxError: as :meth:`detect_frame`; of several, the first, and nothing is returned of the others.
         """
         found, left = [], iter(frames)
         with self._alone:
@@ -165,7 +172,7 @@ class Detector:
             return centres, np.where(scores > DROPPED, scores / SCORE_UNIT, np.nan)
 
     def close(self) -> None:
-        """End the detector's threads."""
+        """End the detector's threads; what is asked of it later runs in the thread that asks."""
         with self._alone:
             self._threads.close()
 

@@ -52,8 +52,12 @@ def open_source(
 
     Args:
         path: of a file or a folder, or ``realsense:``.
-        options: what a bag or a camera does not tell by itself; other sources take none.
+        options: what a bag or a camera does not tell by itself; a depth recording takes ``extrinsics``, others none.
         say: told what is assumed about a bag, a line each; by default these are warnings.
+
+    Returns:
+        A source: it yields each :class:`~headvox.data.Frame` once, in time order, and a
+        :class:`~headvox.data.BadFrame` for what could not be read. ``close`` it in the end.
 
     Raises:
         HeadvoxError: there is nothing there, or nothing that headvox can read; Undecided, which is one, where a bag

@@ -80,7 +80,7 @@ class Tracker:
     # ------------------------------------------------------------------------------------------- the public calls
 
     def update(self, heads: Heads, frame: Frame) -> Tracks:
-        """Take the heads found in ``frame``, and return every track at its stamp.
+        """Take the heads found in ``frame``, world frame, and return every track at its stamp.
 
         The images of the frame tell where a head that was not found may be hidden; a frame without any will do. A
         frame whose stamp is not after the last one's is not tracked: its heads come back as tentative tracks.
@@ -96,7 +96,7 @@ class Tracker:
             return report(self._roster, stamp_ns, stamp_ns)
 
     def predict(self, stamp_ns: int) -> Tracks:
-        """Return where the tracks will be at a stamp that is not before the last frame's; nothing is changed.
+        """Return where the tracks will be at a stamp, in ns, that is not before the last frame's; nothing is changed.
 
         Raises:
             HeadvoxError: an earlier stamp, or one that is not in whole nanoseconds.

@@ -167,6 +167,31 @@ def test_the_input_is_never_written_over(tmp_path: Path, link: str) -> None:
     assert truth.read_text() == "precious\n"
 
 
+@pytest.mark.parametrize("truth", [None, "precious\n"])
+def test_results_of_many_are_never_written_into_a_source(tmp_path: Path, truth: str | None) -> None:
+    """True heads are called heads.jsonl: so would be the results of a recording of that name."""
+    folder = write_recording(tmp_path / "heads", 1)
+    if truth is not None:
+        (folder / "heads.jsonl").write_text(truth)
+    before = sorted(folder.iterdir())
+    for places in ([folder], [write_recording(tmp_path / "other", 1), folder], [folder / "recording.json"]):
+        done = headvox("run", *places, "--into", folder)
+        assert_explained(done)
+        assert "would be written into the input" in done.stderr
+    assert sorted(folder.iterdir()) == before
+    assert truth is None or (folder / "heads.jsonl").read_text() == truth
+
+
+def test_extrinsics_are_never_written_over(recording: Path, tmp_path: Path) -> None:
+    told = "[cameras.cam]\nT_world_camera = [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]\n"
+    place = tmp_path / "place.csv"
+    place.write_text(told)
+    done = headvox("run", recording, "--extrinsics", place, "-o", place)
+    assert_explained(done)
+    assert "would be written into the input" in done.stderr
+    assert place.read_text() == told
+
+
 def test_an_output_that_cannot_be_made_is_explained(recording: Path, tmp_path: Path) -> None:
     assert_explained(headvox("run", recording, "-o", tmp_path / "nowhere" / "out.csv"))
 

@@ -148,6 +148,16 @@ def test_another_detector_by_hand(clouds: Path, tmp_path: Path, capsys: pytest.C
     assert scores["latency_p50_ms"] is None
 
 
+@pytest.mark.parametrize("inside", [".", "report"])
+def test_a_report_is_never_written_into_what_it_is_about(
+    clouds: Path, capsys: pytest.CaptureFixture[str], inside: str
+) -> None:
+    before = sorted(clouds.iterdir())
+    assert main(["eval", str(clouds), "-o", str(clouds / inside)]) == 1
+    assert f"would be written into the input {clouds}" in capsys.readouterr().err
+    assert sorted(clouds.iterdir()) == before
+
+
 def test_limits_set_the_exit_code(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = lines(tmp_path / "other.jsonl", {0: CENTRES[0], 33_333_333: [[2, 0, 1]]})
     command = ["eval", str(clouds), "--heads", str(found), "--limit"]
@@ -261,7 +271,8 @@ def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["eval", "two-cameras", "--scheduler", "local"]) == 2
     assert "two-cameras is made by --workers N of this machine" in capsys.readouterr().err
     assert main(["eval", str(clouds), "--against", "nonsense"]) == 1
-    assert main(["eval", str(clouds), "-o", str(clouds / "0.npy")]) == 1
+    (tmp_path / "file").touch()
+    assert main(["eval", str(clouds), "-o", str(tmp_path / "file")]) == 1
     assert "Cannot make the folder" in capsys.readouterr().err
     capsys.readouterr()
     (clouds / "heads.jsonl").unlink()

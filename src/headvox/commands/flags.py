@@ -75,6 +75,8 @@ def keep_input(output: Path, inputs: Sequence[str | Path | None]) -> None:
         if path is None or not Path(path).exists():
             continue
         source = Path(path).resolve()
+        if source.name == "recording.json":  # its folder is what is read
+            source = source.parent
         same = target == source or (target.exists() and target.samefile(source))
         if same or (source.is_dir() and source in target.parents):
             raise HeadvoxError(

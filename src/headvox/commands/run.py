@@ -134,6 +134,9 @@ def _run_batch(args: argparse.Namespace) -> int:
     places = [str(place) for place in (args.source, *args.more)]
     tracker = None if args.no_track else tracker_config_of(args)
     settings = Settings(args.into, config_of(args), source_options_of(args), tracker)
+    inputs = (*places, args.config, args.extrinsics, settings.detector.cascade)
+    for source in places:  # true heads are called heads.jsonl: results of that name would be taken for them
+        keep_input(settings.target(source), inputs)
     rows = []
     with closing(Live(sys.stderr, None)) as live:
 

@@ -125,5 +125,5 @@ def opened(args: argparse.Namespace, track: bool = True) -> Iterator[Session]:
             closing(Detector(config, note=lambda text: live.note(f"headvox: {text}")))
         )
         tracker = Tracker(tracker_config) if track else None
-        inputs = (path, args.config, config.cascade)
+        inputs = (path, args.config, args.extrinsics, config.cascade)
         yield Session(source, detector, tracker, live, inputs, config, args.strict, args.limit)

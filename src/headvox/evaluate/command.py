@@ -20,6 +20,7 @@ from headvox.commands.flags import (
     UsageError,
     add_settings,
     config_of,
+    keep_input,
     number,
     seed_number,
     tracker_config_of,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from headvox.evaluate.scores import Scores
 
 ALL = ("static", "rotation", "two-cameras", "sample")
+REPORT = "report.json"
 EXAMPLES = """\
 what to evaluate:
   static        the shells of 44 heads, each under 100 random rotations
@@ -97,6 +99,7 @@ def _report(args: argparse.Namespace) -> int:
     plan = _plan(args)
     made = _made(plan, args)  # what is wrong with a cascade, or with the folder, is told now
     if args.output is not None:
+        keep_input(args.output / REPORT, _inputs(args))
         need_matplotlib()
         _make(args.output)
     scores: list[Scores] = []
@@ -126,12 +129,18 @@ def _report(args: argparse.Namespace) -> int:
     scores += [row for row in (pooled(those, plan.rules) for those in recorded.values()) if row is not None]
     report = Report(tuple(scores), made)
     if args.output is not None:
-        report.save(args.output / "report.json")
+        report.save(args.output / REPORT)
     print(report.to_json() if args.json else _text(report, args.details))
     missed = [line for limit in args.limit for line in limit.missed(report)]
     for line in missed:
         print(printable(f"headvox: limit missed: {line}"), file=sys.stderr)
     return LIMIT_MISSED if missed else GOOD
+
+
+def _inputs(args: argparse.Namespace) -> list[str | Path | None]:
+    """Return the files and folders that are read."""
+    places = [what for what in args.what if what not in (*ALL, "all", "peers")]
+    return [*places, args.heads, args.clouds, args.config]
 
 
 def _make(folder: Path) -> None:

@@ -28,6 +28,10 @@ class Settings:
     options: SourceOptions
     tracker: TrackerConfig | None
 
+    def target(self, place: str) -> Path:
+        """Return the file for the results of one source."""
+        return self.into / f"{name_of(place)}{SUFFIX}"
+
 
 @dataclass(frozen=True, slots=True)
 class Done:
@@ -85,7 +89,7 @@ def _absolute(place: str) -> str:
 def run_one(place: str, settings: Settings) -> Done:
     """Run over one recording, unless its file is there."""
     name = name_of(place)
-    target = settings.into / f"{name}{SUFFIX}"
+    target = settings.target(place)
     if target.exists():
         return Done(name, was_there=True)
     part = target.with_name(f"{target.name}.{os.getpid()}.part")

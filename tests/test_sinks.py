@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,17 @@ def test_files_are_whole_at_every_moment(tmp_path: Path) -> None:
             assert len(text.splitlines()) == n + name.endswith("csv")
         sink.close()
         sink.close()
+
+
+@pytest.mark.parametrize("name", ["out.jsonl", "out.csv", "out.tum", "out.mcap"])
+def test_without_a_result_an_older_file_stays(tmp_path: Path, name: str) -> None:
+    older = tmp_path / name.replace(".tum", "_3.tum")
+    older.write_text("precious\n")
+    open_sink(tmp_path / name).close()
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["precious\n"]
+    with closing(open_sink(tmp_path / name)) as sink:
+        sink.write(RESULT)
+    assert not older.exists() or b"precious" not in older.read_bytes()
 
 
 def test_csv_has_a_row_a_head(tmp_path: Path) -> None:

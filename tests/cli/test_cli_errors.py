@@ -54,6 +54,17 @@ def test_only_bad_frames_are_no_success(tmp_path: Path) -> None:
     assert_explained(headvox("run", write_recording(tmp_path / "one", 1, bad=(0,)), "--json"))
 
 
+@pytest.mark.parametrize("command", [("run", "keep.csv"), ("run", "keep.mcap"), ("view", "keep.rrd")])
+def test_a_run_that_fails_leaves_an_older_file_as_it_was(tmp_path: Path, command: tuple[str, str]) -> None:
+    folder = write_recording(tmp_path / "recording", 2, bad=(0, 1))
+    name, output = command
+    (tmp_path / output).write_text("precious\n")
+    for target in (tmp_path / output, tmp_path / f"new_{output}"):
+        assert headvox(name, folder, "-o", target).returncode == 1
+    assert (tmp_path / output).read_text() == "precious\n"
+    assert not (tmp_path / f"new_{output}").exists()
+
+
 def test_a_source_without_frames_is_no_success(tmp_path: Path) -> None:
     assert_explained(headvox("run", write_recording(tmp_path / "recording", 0)))
     (tmp_path / "empty").mkdir()

@@ -6,13 +6,15 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from headvox.errors import HeadvoxError, MissingExtra
 from headvox.ros.outputs import Content
+from headvox.writable import check_file
 
 CHUNK_BYTES = 256 << 10  # what is lost at most when the process is killed
 # vision_msgs is in no distribution's common messages: these are its definitions in ROS 2 Humble and later.
@@ -30,7 +32,7 @@ class McapFile:
     """An MCAP file that grows; closed by :meth:`close`, or by Ctrl-C through it, it is whole."""
 
     def __init__(self, path: Path) -> None:
-        """Make the file; an older one is replaced.
+        """Make ready to write; an older file is replaced by the first message: without one it stays.
 
         Raises:
             HeadvoxError: a package is missing, or the file cannot be made.
@@ -47,13 +49,11 @@ class McapFile:
             self._store.register(typesys.get_types_from_msg(definition, f"vision_msgs/msg/{name}"))
         self._topics: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        try:
-            self._file = path.open("wb")
-            self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-            self._writer.start("ros2")
-        except OSError as error:
-            raise HeadvoxError(f"Output {path}: {error.strerror or error}.", "Check the path.") from None
-        self._open = True
+        self._writer_to = partial(Writer, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer: Any = None
+        self._file: BinaryIO | None = None
+        self._open = False
+        check_file(path)
 
     def write(self, topic: str, kind: str, stamp_ns: int, content: Content) -> None:
         """Write a message of a type such as ``geometry_msgs/msg/PoseArray``, recorded at its own stamp.
@@ -64,9 +64,17 @@ class McapFile:
         message = message_of(self._store, kind, content)
         data = bytes(self._store.serialize_cdr(message, kind))
         with self._whole():
+            if self._writer is None:
+                self._start()
             if topic not in self._topics:
                 self._topics[topic] = self._writer.register_channel(topic, "cdr", self._schema(kind))
             self._writer.add_message(self._topics[topic], stamp_ns, data, stamp_ns)
+
+    def _start(self) -> None:
+        self._file = self.path.open("wb")
+        self._writer = self._writer_to(self._file)
+        self._writer.start("ros2")
+        self._open = True
 
     def _schema(self, kind: str) -> int:
         if kind not in self._schemas:
@@ -76,7 +84,7 @@ class McapFile:
 
     def close(self) -> None:
         """Write the index and close the file."""
-        if not self._open:
+        if self._file is None or not self._open:
             return
         self._open = False
         finish: Callable[[], None] = self._writer.finish
@@ -90,11 +98,13 @@ class McapFile:
         try:
             with uninterrupted():
                 yield
-                self._file.flush()
+                if self._file is not None:
+                    self._file.flush()
         except OSError as error:
             self._open = False
-            with suppress(OSError):
-                self._file.close()
+            if self._file is not None:
+                with suppress(OSError):
+                    self._file.close()
             raise HeadvoxError(
                 f"Output {self.path}: {error.strerror or error}.",
                 "What was written before is got back with: mcap recover",

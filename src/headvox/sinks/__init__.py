@@ -13,7 +13,8 @@ SUFFIXES = (".jsonl", ".csv", ".tum", ".mcap")
 
 
 def open_sink(path: Path, frame: str = "world") -> Sink:
-    """Return a sink that writes ``path``, of the kind that its suffix says; an older file is replaced.
+    """Return a sink that writes ``path``, of the kind that its suffix says; an older file is
+    replaced by the first result: without one it stays.
 
     ``frame`` is what ROS calls the world that the heads are in.
 

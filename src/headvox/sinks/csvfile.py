@@ -20,13 +20,14 @@ class CsvFile:
 
     def __init__(self, path: Path) -> None:
         self._file = LineFile(path)
-        self._file.line(",".join(COLUMNS))
+        self._head = [",".join(COLUMNS)]
 
     def write(self, result: Result) -> None:
         """Write the rows of one frame."""
-        rows = [_row(result, row) for row in result.rows()]
-        if rows:
-            self._file.line("\n".join(rows))
+        lines = self._head + [_row(result, row) for row in result.rows()]
+        if lines:
+            self._file.line("\n".join(lines))
+        self._head = []
 
     def close(self) -> None:
         """Close the file."""

@@ -200,14 +200,14 @@ def main(pace: str, path: str | None = None) -> None:
         give_way()
     os.environ.update(viewer.quiet_environment())
     recording = rr.RecordingStream("headvox", send_properties=False)
-    if path is not None:
-        recording.save(path)
-    else:
+    if path is None:
         viewer.start()
         recording.connect_grpc(viewer.url())
     log, first = Log(recording), True
     for seen in letters(sys.stdin.buffer):
         if first:
+            if path is not None:  # not before: without a frame, what stood there stays
+                recording.save(path)
             recording.send_blueprint(blueprint(seen.frame))
             first = False
         log.show(seen)

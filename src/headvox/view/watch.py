@@ -13,6 +13,7 @@ from headvox.data import F64, Frame
 from headvox.errors import HeadvoxError, MissingExtra
 from headvox.sinks import Result
 from headvox.view.mailbox import Mailbox
+from headvox.writable import check_file
 
 SHOWN_HZ = 10
 """How many frames of a second are shown at most, unless all are wanted: what draws them leaves the loop cold caches."""
@@ -86,10 +87,7 @@ def check(path: Path | None) -> None:
     if importlib.util.find_spec("rerun") is None:
         raise MissingExtra("The viewer needs rerun.", "view")
     if path is not None:
-        try:
-            path.open("ab").close()
-        except OSError as error:
-            raise HeadvoxError(f"Output {path}: {error.strerror or error}.", "Check the path.") from None
+        check_file(path)
     elif sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise HeadvoxError(
             "There is no display to show anything on.",

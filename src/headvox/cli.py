@@ -152,15 +152,16 @@ def _forget_stdout() -> None:
 def _convert(args: argparse.Namespace) -> int:
     from headvox.commands.convert import convert
     from headvox.commands.live import Live
+    from headvox.remarks import Remarks
     from headvox.sources import open_source
 
     notes: list[str] = []
     with closing(open_source(args.source, source_options_of(args), notes.append)) as source:
         keep_input(args.output, [args.source])
-        with closing(Live(sys.stderr, source.length)) as live:
+        with closing(Live(sys.stderr, source.length)) as live, closing(Remarks(live.tell)) as remarks:
             for note in notes:
-                live.note(f"headvox: {note}")
-            done, bad = convert(source, args.output, lambda k: live.show(f"frame {k}"))
+                live.tell(note)
+            done, bad = convert(source, args.output, lambda k: live.show(f"frame {k}"), remarks.skipped)
     size = f"{args.output.stat().st_size / 1e6:.1f} MB"
     print(
         table(

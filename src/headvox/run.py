@@ -122,13 +122,22 @@ def run(
     except KeyboardInterrupt:
         report.interrupted = True
         return report
-    if report.frames == 0:
-        raise HeadvoxError(f"{source.name}: there is no frame in it.", "Check how it was recorded.")
-    if report.bad == report.frames:
-        raise HeadvoxError(
-            f"{source.name}: none of the {report.frames} frames could be used.", "The reasons are above."
-        )
+    check_any(source, report.frames, report.bad)
     return report
+
+
+def check_any(source: Source, frames: int, bad: int) -> None:
+    """See that there was something in a source.
+
+    Raises:
+        HeadvoxError: there was no frame at all, or none that could be used.
+    """
+    if frames == 0:
+        raise HeadvoxError(f"{source.name}: there is no frame in it.", "Check how it was recorded.")
+    if bad == frames:
+        raise HeadvoxError(
+            f"{source.name}: none of the {frames} frames could be used.", "The reasons are above."
+        )
 
 
 def look(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from command import assert_explained, headvox, headvox_process
+from inputs import write_recording
 
 from headvox import __version__, cli
 
@@ -43,6 +44,23 @@ def test_info_tells_what_is_there(recording: Path) -> None:
     done = headvox("info", recording)
     assert done.returncode == 0, done.stderr
     assert "80x60" in done.stdout
+
+
+def test_a_conversion_tells_which_frames_it_leaves_out_and_why(tmp_path: Path) -> None:
+    bag = tmp_path / "out.mcap"
+    done = headvox("convert", write_recording(tmp_path / "some", 4, bad=(1, 2)), "-o", bag)
+    assert done.returncode == 0
+    skipped, more = done.stderr.splitlines()
+    assert skipped.startswith("headvox: frame 1 skipped: cam/bad.png: ")
+    assert more == "headvox: 1 more skipped for the same reason"
+    rows = dict(line.rsplit(maxsplit=1) for line in done.stdout.splitlines() if "frames" in line)
+    assert rows == {"frames": "2", "bad frames": "2"}
+    before = bag.read_bytes()
+    done = headvox("convert", write_recording(tmp_path / "none", 2, bad=(0, 1)), "-o", bag)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "frame 0 skipped: " in done.stderr
+    assert "none: none of the 2 frames could be used" in done.stderr
+    assert bag.read_bytes() == before
 
 
 def test_masks_are_listed_and_shown(anything: Path) -> None:

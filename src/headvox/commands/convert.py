@@ -14,27 +14,34 @@ from headvox.ros.bagfile import CAMERA_INFO, CLOUD, IMAGE, TRANSFORMS
 from headvox.ros.mcapfile import McapFile
 from headvox.ros.messages import MILLIMETRE
 from headvox.ros.outputs import Content, header_of, xyz_of
+from headvox.run import check_any
 from headvox.sources import Source
 
 WORLD = "world"
 
 
 def convert(
-    source: Source, path: Path, on_frame: Callable[[int], None] = lambda done: None
+    source: Source,
+    path: Path,
+    on_frame: Callable[[int], None] = lambda done: None,
+    on_bad: Callable[[int, str], None] = lambda index, reason: None,
 ) -> tuple[int, int]:
     """Write the frames of ``source`` to an MCAP file; return how many, and how many could not be read.
 
     Depth images are 16UC1 in millimetres, or 32FC1 where a recording has another scale; each has its CameraInfo beside
-    it. Where a sensor stands is told on /tf with every frame. Nothing here tells where the heads are.
+    it. Where a sensor stands is told on /tf with every frame. Nothing here tells where the heads are. ``on_bad`` is
+    told of each frame that cannot be read: its index, the reason.
 
     Raises:
-        HeadvoxError: the file cannot be made, or the source not be read.
+        HeadvoxError: the file cannot be made, the source not be read, or there is no frame in it that could be used: an
+            older file stays then.
     """
     file = McapFile(path)
     done = bad = 0
     try:
         for frame in source:
             if isinstance(frame, BadFrame):
+                on_bad(done, frame.reason)
                 bad += 1
             else:
                 _write(file, frame)
@@ -42,6 +49,7 @@ def convert(
             on_frame(done)
     finally:
         file.close()
+    check_any(source, done, bad)
     return done, bad
 
 

@@ -26,6 +26,10 @@ class Live:
         self._wipe()
         self._stream.write(printable(text) + "\n")
 
+    def tell(self, text: str) -> None:
+        """Write a line that stays and says who tells it."""
+        self.note(f"headvox: {text}")
+
     def frame(self, report: Report) -> None:
         """Show the state of the run."""
         now = time.monotonic()

@@ -164,6 +164,17 @@ def test_one_that_cannot_be_used_does_not_stop_the_others(recordings, tmp_path):
         )
 
 
+def test_what_was_broken_off_leaves_nothing(recordings, tmp_path, monkeypatch):
+    def interrupted(place: str, name: str, part: Path, settings: batch.Settings) -> batch.Done:
+        part.write_text("half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch, "_run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        batch.run_one(str(recordings[0]), batch.Settings(tmp_path, FAST, SourceOptions(), None))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_command_line_of_a_batch(recordings, tmp_path):
     def headvox(*flags: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "headvox", *map(str, flags)]

@@ -95,11 +95,12 @@ def run_one(place: str, settings: Settings) -> Done:
     part = target.with_name(f"{target.name}.{os.getpid()}.part")
     try:
         done = _run(place, name, part, settings)
+        os.replace(part, target)
+        return done
     except HeadvoxError as error:
-        part.unlink(missing_ok=True)
         return Done(name, failure=str(error))
-    os.replace(part, target)
-    return done
+    finally:  # whatever ends it, Ctrl-C too: what is not whole is nothing
+        part.unlink(missing_ok=True)
 
 
 def _run(place: str, name: str, part: Path, settings: Settings) -> Done:

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from headvox.machine.interrupts import AGAIN_S, heeded
+from headvox.machine.interrupts import AGAIN_S, Terminated, heeded, terminable
 
 
 @pytest.fixture(autouse=True)
@@ -66,3 +66,22 @@ def test_what_breaks_down_because_of_it_was_interrupted():
     with pytest.raises(KeyboardInterrupt):
         work()
     time.sleep(3 * AGAIN_S)  # and no second one comes
+
+
+def test_sigterm_ends_as_ctrl_c_does_even_where_that_is_ignored_and_it_is_swallowed(capsys):
+    class Ended:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    def work():
+        with heeded():
+            Ended()
+            time.sleep(60)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.getsignal(signal.SIGTERM)
+    with terminable() as came, pytest.raises(Terminated):
+        work()
+    assert came == [signal.SIGTERM, signal.SIGTERM]
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert capsys.readouterr().err == ""

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -60,6 +61,31 @@ def test_what_a_piece_of_work_raises_comes_through(workers):
     with pytest.raises(HeadvoxError, match="Three is too many") as caught:
         list(workers.map(refuse, range(6)))
     assert caught.value.do == "Take two."
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_in_the_middle_of_their_work_with_who_has_started_them(tmp_path, number):
+    def count(kind: str, least: int) -> int:
+        """How many have begun or ended; ``least`` are waited for."""
+        end = time.monotonic() + 60.0
+        while len(list(tmp_path.glob(f"*.{kind}"))) < least and time.monotonic() < end:
+            time.sleep(0.05)
+        return len(list(tmp_path.glob(f"*.{kind}")))
+
+    command = [sys.executable, str(Path(__file__).with_name("dozing.py")), str(tmp_path)]
+    heeds = partial(
+        signal.signal, signal.SIGINT, signal.default_int_handler
+    )  # should this be in the background
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, preexec_fn=heeds) as process:
+        try:
+            assert count("begun", 2) == 2
+            process.send_signal(number)
+            assert process.wait(30) != 0
+        finally:
+            process.kill()
+    assert count("ended", 2) == 2
+    assert count("begun", 0) == 2  # and took nothing else
 
 
 def test_the_work_of_a_worker_that_is_killed_is_done_by_another(tmp_path):

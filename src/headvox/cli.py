@@ -1,7 +1,7 @@
 """The command ``headvox``: flags in, calls to the library, exit codes out.
 
-0 good, 1 a known error, 2 wrong usage, 3 a limit of eval missed, 130 Ctrl-C. Heavy imports are inside the commands,
-so that ``--help`` is immediate. Results go to standard output and nothing else does.
+0 good, 1 a known error, 2 wrong usage, 3 a limit of eval missed, 130 Ctrl-C, 143 SIGTERM. Heavy imports are inside the
+commands, so that ``--help`` is immediate. Results go to standard output and nothing else does.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from headvox.commands.flags import (
     GOOD,
     INTERRUPTED,
     KNOWN_ERROR,
+    TERMINATED,
     USAGE,
     UsageError,
     add_command,
@@ -37,7 +38,7 @@ from headvox.commands.flags import (
 )
 from headvox.commands.table import printable, table
 from headvox.errors import HeadvoxError, Undecided
-from headvox.machine.interrupts import heeded
+from headvox.machine.interrupts import heeded, terminable
 from headvox.render import command as render_command
 from headvox.view import command as view_command
 
@@ -67,13 +68,19 @@ examples:
   headvox synth two-cameras -o rig             a recording of synthetic people, with their true heads
   headvox eval rig                             how many of them are found, and how well
 
-exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 3 an eval limit missed, 130 Ctrl-C
+exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 3 an eval limit missed, 130 Ctrl-C,
+  143 SIGTERM
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (by default the process's own) and return its exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    with terminable() as terminated:
+        code = _main(list(sys.argv[1:] if argv is None else argv))
+    return TERMINATED if terminated and code == INTERRUPTED else code
+
+
+def _main(arguments: list[str]) -> int:
     debug = "--debug" in arguments
     try:
         with heeded():

@@ -17,7 +17,8 @@ def heed_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def test_ctrl_c_ends_with_130_and_whole_lines(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_what_is_interrupted_ends_with_whole_lines(tmp_path: Path, number: int, code: int) -> None:
     folder = write_recording(tmp_path / "long", 20_000)
     command = [str(COMMAND), "run", str(folder), "--json", "-o", str(tmp_path / "out.jsonl")]
     with subprocess.Popen(
@@ -30,10 +31,10 @@ def test_ctrl_c_ends_with_130_and_whole_lines(tmp_path: Path) -> None:
         assert process.stdout is not None
         assert process.stderr is not None
         first = process.stdout.readline()
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         rest = process.stdout.read()
         errors = process.stderr.read()
-    assert process.returncode == 130
+    assert process.returncode == code
     assert errors == ""
     written = (tmp_path / "out.jsonl").read_text()
     assert written.endswith("\n")

@@ -159,23 +159,24 @@ def test_tracks_have_frames_of_their_own(tmp_path):
     )  # its axes
 
 
-def test_a_run_that_is_interrupted_leaves_a_bag_that_can_be_read(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_is_interrupted_leaves_a_bag_that_can_be_read(tmp_path, monkeypatch, number):
     sink = open_sink(tmp_path / "heads.mcap")
     sink.write(Result(0, STAMP, 1.0, heads_at((1.0, 2.0, 1.7))))
     writer = sink._file._writer
     write = writer.add_message
 
     def interrupted(*arguments):
-        signal.raise_signal(signal.SIGINT)  # within a record
+        signal.raise_signal(number)  # within a record
         write(*arguments)
 
     monkeypatch.setattr(writer, "add_message", interrupted)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+    before = signal.signal(number, signal.default_int_handler)  # a job in the background ignores it
     try:
         with pytest.raises(KeyboardInterrupt):
             sink.write(Result(1, STAMP + 5, 1.0, heads_at((1.0, 2.0, 1.7))))
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
     sink.close()
     assert [stamp for topic, stamp, _ in read(tmp_path / "heads.mcap") if topic == "/head_detector/heads"] == [
         STAMP, STAMP + 5,

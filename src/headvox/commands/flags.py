@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
     Command = Callable[[argparse.Namespace], int]
 
-GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED = 0, 1, 2, 3, 130
+GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED, TERMINATED = 0, 1, 2, 3, 130, 143
 """What a command tells the shell."""
 
 

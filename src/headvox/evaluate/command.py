@@ -58,7 +58,7 @@ examples:
   headvox eval recording --heads other.jsonl        another detector's results
   headvox eval compare old/report.json new/report.json
 
-exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 3 a limit missed, 130 Ctrl-C
+exit codes: 0 good, 1 an error that is explained, 2 wrong usage, 3 a limit missed, 130 Ctrl-C, 143 SIGTERM
 """
 
 

@@ -1,8 +1,9 @@
-"""Ctrl-C that is not lost, wherever it falls."""
+"""Ctrl-C that is not lost, wherever it falls, and SIGTERM that ends as well."""
 
 from __future__ import annotations
 
 import _thread
+import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -10,6 +11,35 @@ from contextlib import contextmanager
 from typing import Any
 
 AGAIN_S = 0.02
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: what is done at Ctrl-C is to be done."""
+
+
+@contextmanager
+def terminable() -> Iterator[list[int]]:
+    """Let SIGTERM end what runs as Ctrl-C does; the list that this gives holds it once it has come.
+
+    Files are finished then, and workers ended. To be entered in the main thread; in another one it does nothing.
+
+    Raises:
+        Terminated: it came.
+    """
+    came: list[int] = []
+
+    def end(number: int, frame: Any) -> None:
+        came.append(number)
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -26,8 +56,9 @@ def heeded() -> Iterator[None]:
     due: list[threading.Timer] = []
 
     def interrupt_again(unraisable: Any) -> None:
-        if unraisable.exc_type is KeyboardInterrupt:
-            due.append(threading.Timer(AGAIN_S, _thread.interrupt_main))
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            number = signal.SIGTERM if unraisable.exc_type is Terminated else signal.SIGINT
+            due.append(threading.Timer(AGAIN_S, _thread.interrupt_main, [number]))
             due[-1].start()
         else:
             before(unraisable)

@@ -7,11 +7,15 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from threading import Thread
 from typing import Any, TypeVar
 
 from headvox.errors import HeadvoxError
+from headvox.machine.interrupts import heeded, terminable
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -44,8 +48,8 @@ class Workers:
     def map(self, job: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Made]:
         """Yield ``job(item)`` for all items, in order.
 
-        ``job`` and what it returns have to be picklable. When the caller stops early, what was begun is ended and the
-        rest is not begun.
+        ``job`` and what it returns have to be picklable. When the caller stops early, what was begun is broken
+        off and the rest is not begun.
 
         Raises:
             HeadvoxError: the scheduler cannot be used (see :mod:`headvox.parallel.cluster`), or ``job`` raised it.
@@ -91,15 +95,34 @@ def _in_processes(job: Callable[[Item], Made], items: Sequence[Item], count: int
     if count < 2:
         yield from map(job, items)
         return
-    with ProcessPoolExecutor(count, get_context("spawn"), _start, (job,)) as pool:
-        yield from pool.map(_do, items)
+    context = get_context("spawn")
+    theirs, ours = context.Pipe(duplex=False)
+    with theirs, ours, ProcessPoolExecutor(count, context, _start, (job, theirs)) as pool:
+        try:
+            yield from pool.map(_do, items)
+        except BaseException:  # Ctrl-C, too: nobody wants what they are at
+            ours.close()
+            raise
 
 
-def _start(job: Callable[[Any], Any]) -> None:
+def _start(job: Callable[[Any], Any], parent: Connection) -> None:
     global _job
     _job = job
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the parent alone answers
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: Connection) -> None:
+    """End this process when the other end is closed: its parent wants no more of it, or is gone."""
+    with suppress(EOFError, OSError):
+        parent.recv_bytes()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _do(item: Any) -> Any:
-    return _job(item)
+    try:
+        with terminable(), heeded():  # so that what is half done can be taken away
+            return _job(item)
+    except KeyboardInterrupt:  # which the pool would take for a result, and go on
+        os._exit(1)

@@ -113,18 +113,20 @@ class McapFile:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back until the block is done; it comes to the main thread only."""
+    """Hold Ctrl-C and SIGTERM back until the block is done; they come to the main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    held: list[tuple[int, Any]] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
+    held: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda number, frame: held.append(number)) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-        if held and callable(before):
-            before(*held[0])
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+        for came in held[:1]:
+            signal.raise_signal(came)
 
 
 def message_of(store: Any, kind: str, content: Content) -> Any:

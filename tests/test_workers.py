@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from headvox.evaluate.match import Rules
 from headvox.evaluate.outcome import Outcome, Plan, evaluate_all, pooled
 from headvox.parallel import batch, cluster
 from headvox.parallel.workers import ALONE, Workers
+from headvox.run import Report
 from headvox.sources.options import SourceOptions
 from headvox.sources.remote import fetched
 from headvox.synth import mannequin, presets
@@ -191,7 +193,7 @@ def test_one_that_cannot_be_used_does_not_stop_the_others(recordings, tmp_path):
 
 
 def test_what_was_broken_off_leaves_nothing(recordings, tmp_path, monkeypatch):
-    def interrupted(place: str, name: str, part: Path, settings: batch.Settings) -> batch.Done:
+    def interrupted(place: str, part: Path, settings: batch.Settings, tell: Callable[[str], None]) -> Report:
         part.write_text("half")
         raise KeyboardInterrupt
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from dataclasses import fields
 from pathlib import Path
@@ -16,6 +17,7 @@ from inputs import write_recording
 from headvox.commands import session
 from headvox.commands.flags import TRACKER_FLAGS
 from headvox.config import TrackerConfig
+from headvox.sample import sample_folder
 
 # ----------------------------------------------------------------------------------------------------------- run --json
 
@@ -254,3 +256,34 @@ def test_a_trajectory_a_track(recording: Path, anything: Path, tmp_path: Path) -
         np.testing.assert_allclose(rows[-1, 4:], wanted, atol=1e-6)
     assert_explained(headvox("run", recording, "--no-track", "-o", tmp_path / "out.tum"), 2)
     assert_explained(headvox("run", recording, "-o", tmp_path / "nowhere" / "out.tum"))
+
+
+# ------------------------------------------------------------------------------------------------------- many, --into
+
+
+def test_a_batch_tells_what_every_run_tells(tmp_path: Path) -> None:
+    """Each in turn: a frame that is skipped, a floor elsewhere, one that cannot be used, one that is there already."""
+    some = write_recording(tmp_path / "some", 3, bad=(1,))
+    high = tmp_path / "high"
+    shutil.copytree(sample_folder(), high)
+    text = json.loads((high / "recording.json").read_text())
+    for camera in text["cameras"].values():
+        camera["T_world_camera"][2][3] += 0.8
+    (high / "recording.json").write_text(json.dumps(text))
+    none = write_recording(tmp_path / "none", 2, bad=(0, 1))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "there.jsonl").touch()
+    done = headvox("run", some, high, none, tmp_path / "there", "--into", tmp_path / "out", "--no-track")
+    assert done.returncode == 1
+    lines = done.stderr.splitlines()
+    assert lines[0].startswith("headvox: some: frame 1 skipped: cam/bad.png: ")
+    assert (
+        "headvox: high: left: what looks like the floor tilts by 0 degrees and lies at z = 0.80 m" in lines[1]
+    )
+    assert lines[2].startswith("headvox: none: frame 0 skipped: ")
+    assert lines[3] == "headvox: none: 1 more skipped for the same reason"
+    assert lines[4].startswith("headvox: none: none: none of the 2 frames could be used.")
+    rows = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines()}
+    assert rows["some"] == ["3", "0", "1", "done"]
+    assert rows["none"] == ["-", "-", "-", "failed"]
+    assert rows["there"] == ["-", "-", "-", "was", "there", "already"]

@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+import warnings
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_writers import KINDS, NS, Maker, write_bag
+from command import headvox
 
 from headvox.data import BadFrame, Frame, Intrinsics
 from headvox.errors import HeadvoxError, Undecided
@@ -189,6 +191,24 @@ def test_the_stamps_of_the_recorder_stand_in_for_none(tmp_path):
     messages = [("/fused", START + k * STEP, maker.cloud(0, "map", POINTS)) for k in range(3)]
     frames = list(opened(write_bag(tmp_path, "mcap", messages))[0])
     assert [frame.stamp_ns for frame in frames] == [START + k * STEP for k in range(3)]
+
+
+def test_a_batch_and_an_evaluation_tell_what_is_assumed_and_what_is_to_be_chosen(tmp_path):
+    maker = Maker()
+    cloud = ("/cam/points", START, maker.cloud(START, "camera_link", POINTS))
+    another = ("/left/depth/points", START, maker.cloud(START, "left_optical", POINTS))
+    assumed = write_bag(tmp_path, "bare-mcap", [cloud], "assumed")
+    several = write_bag(tmp_path, "bare-mcap", [*rig(maker), another], "several")
+    done = headvox("run", assumed, several, "--into", tmp_path / "out", "--no-track")
+    assert "headvox: assumed: " in done.stderr
+    assert "is taken to stand 1.2 m above the floor" in done.stderr
+    assert "    --topic /left/depth/points  cloud, 50 points" in done.stderr.splitlines()
+    (tmp_path / "heads.jsonl").write_text(f'{{"stamp_ns": {START}, "heads": []}}\n')
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = headvox("eval", assumed, "--no-track")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("is taken to stand 1.2 m above the floor") == 1
 
 
 # ------------------------------------------------------------------------------------------------------ in doubt

@@ -141,9 +141,12 @@ def _run_batch(args: argparse.Namespace) -> int:
     with closing(Live(sys.stderr, None)) as live:
 
         def tell(done: Done) -> None:
-            rows.append([done.name, str(done.frames), str(done.heads), str(done.bad), _how(done)])
-            if done.failure:
-                live.note(f"headvox: {done.name}: {done.failure}")
+            counts = ["-" if n is None else str(n) for n in (done.frames, done.heads, done.bad)]
+            rows.append([done.name, *counts, _how(done)])
+            for line in (*done.notes, *([done.failure] if done.failure else [])):
+                live.tell(f"{done.name}: {line}")
+            for choice in done.choices:
+                live.note(f"    {choice}")
             live.show(f"{len(rows)} of {len(places)} done")
 
         every = run_batch(places, settings, of_flags(args), tell)

@@ -205,7 +205,9 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
                 raise UsageError("peers needs --clouds FOLDER, with the four meshes of the paper's authors")
             made.append(around(args.clouds))
         else:
-            scenario = known.remote_recording(what) if is_remote(what) else known.recording(Path(what))
+            scenario = (
+                known.remote_recording(what) if is_remote(what) else known.recording(Path(what), live.tell)
+            )
             is_known = scenario.name in [other.name for other in made]
             made.append(replace(scenario, name=what) if is_known else scenario)
     if args.keep is not None:

@@ -143,8 +143,8 @@ def _row(head: TrueHead, ids_from: int) -> dict[str, object]:
     }
 
 
-def recording(path: Path) -> Scenario:
-    """Whatever :func:`headvox.open_source` reads, with ``heads.jsonl`` in its folder.
+def recording(path: Path, say: Callable[[str], None] | None = None) -> Scenario:
+    """Whatever :func:`headvox.open_source` reads, with ``heads.jsonl`` in its folder; it has ``say``, too.
 
     Raises:
         HeadvoxError: nothing to read, no heads.jsonl, or none of its stamps is one of the recording.
@@ -152,12 +152,12 @@ def recording(path: Path) -> Scenario:
     from headvox.sources import open_source
 
     ids = [who for true in _truth_of(path).values() for who in true.ids.tolist()]
-    source = open_source(path)
+    source = open_source(path, say=say)
     source.close()
     return Scenario(
         source.name,
         source.length or 0,
-        partial(_recorded, path.absolute()),
+        partial(_recorded, path.absolute(), _unsaid),
         synthetic=False,
         recording=source.name,
         identified=len(ids) > 0 and NO_ID not in ids,
@@ -179,11 +179,15 @@ def _truth_of(path: Path) -> dict[int, TrueHeads]:
     return read_truth(folder / FILE)
 
 
-def _recorded(path: Path) -> Iterator[Labelled]:
+def _unsaid(text: str) -> None:
+    """Say nothing: it was said when the recording was opened first."""
+
+
+def _recorded(path: Path, say: Callable[[str], None] | None = None) -> Iterator[Labelled]:
     from headvox.sources import open_source
 
     truth = _truth_of(path)
-    with closing(open_source(path)) as reading:
+    with closing(open_source(path, say=say)) as reading:
         for frame in reading:
             yield frame, truth.get(frame.stamp_ns)
 

@@ -9,12 +9,16 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from headvox.config import DetectorConfig, TrackerConfig
-from headvox.errors import HeadvoxError
+from headvox.errors import HeadvoxError, Undecided
 from headvox.parallel.workers import Workers
 from headvox.sinks import Result, Sink
 from headvox.sources.options import SourceOptions
+
+if TYPE_CHECKING:
+    from headvox.run import Report
 
 SUFFIX = ".jsonl"
 
@@ -35,14 +39,20 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of one recording: how much there was, and ``failure``, one line, if it could not be used."""
+    """What came of one recording: how much there was, None where that is not known.
+
+    ``failure`` is one line, if it could not be used, and ``choices`` are lines to choose from, if it can be taken in
+    several ways. ``notes`` are the lines that any run has to tell.
+    """
 
     name: str
-    frames: int = 0
-    bad: int = 0
-    heads: int = 0
+    frames: int | None = None
+    bad: int | None = None
+    heads: int | None = None
     was_there: bool = False
     failure: str = ""
+    choices: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def run_batch(
@@ -93,18 +103,21 @@ def run_one(place: str, settings: Settings) -> Done:
     if target.exists():
         return Done(name, was_there=True)
     part = target.with_name(f"{target.name}.{os.getpid()}.part")
+    notes: list[str] = []
     try:
-        done = _run(place, name, part, settings)
+        report = _run(place, part, settings, notes.append)
         os.replace(part, target)
-        return done
+        return Done(name, report.frames, report.bad, report.heads, notes=tuple(notes))
     except HeadvoxError as error:
-        return Done(name, failure=str(error))
+        choices = error.choices if isinstance(error, Undecided) else ()
+        return Done(name, failure=str(error), choices=choices, notes=tuple(notes))
     finally:  # whatever ends it, Ctrl-C too: what is not whole is nothing
         part.unlink(missing_ok=True)
 
 
-def _run(place: str, name: str, part: Path, settings: Settings) -> Done:
+def _run(place: str, part: Path, settings: Settings, tell: Callable[[str], None]) -> Report:
     from headvox.pipeline import Detector
+    from headvox.remarks import Remarks
     from headvox.run import run
     from headvox.sinks.jsonl import JsonFile
     from headvox.sources import open_source
@@ -113,15 +126,23 @@ def _run(place: str, name: str, part: Path, settings: Settings) -> Done:
 
     with (
         fetched(place) as path,
-        closing(open_source(path, settings.options)) as source,
-        closing(Detector(settings.detector)) as detector,
+        closing(open_source(path, settings.options, tell)) as source,
+        closing(Detector(settings.detector, note=tell)) as detector,
         closing(_Untimed(JsonFile(part))) as sink,
+        closing(Remarks(tell)) as remarks,
     ):
-        tracker = None if settings.tracker is None else Tracker(settings.tracker)
-        report = run(source, detector, [sink], tracker=tracker)
+        report = run(
+            source,
+            detector,
+            [sink],
+            tracker=None if settings.tracker is None else Tracker(settings.tracker),
+            on_bad=remarks.skipped,
+            on_result=lambda frame, result: remarks.used(frame),
+        )
+        remarks.ended(source, report)
     if report.interrupted:
         raise KeyboardInterrupt
-    return Done(name, report.frames, report.bad, report.heads)
+    return report
 
 
 class _Untimed:

@@ -148,6 +148,17 @@ def test_another_detector_by_hand(clouds: Path, tmp_path: Path, capsys: pytest.C
     assert scores["latency_p50_ms"] is None
 
 
+def test_without_matplotlib_there_is_a_report_without_pictures(
+    clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    found = lines(tmp_path / "other.jsonl", {0: CENTRES[0]})
+    out = tmp_path / "report"
+    assert main(["eval", str(clouds), "--heads", str(found), "-o", str(out)]) == 0
+    assert "without matplotlib there will be report.json alone" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["report.json"]
+
+
 @pytest.mark.parametrize("inside", [".", "report"])
 def test_a_report_is_never_written_into_what_it_is_about(
     clouds: Path, capsys: pytest.CaptureFixture[str], inside: str

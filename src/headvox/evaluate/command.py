@@ -91,7 +91,6 @@ def _compare(argv: Sequence[str]) -> int:
 
 def _report(args: argparse.Namespace) -> int:
     from headvox.evaluate.outcome import evaluate, evaluate_all, pooled
-    from headvox.evaluate.plots import need_matplotlib
     from headvox.evaluate.report import Report
     from headvox.evaluate.tracking import need_motmetrics
     from headvox.evaluate.truth import NO_ID
@@ -100,11 +99,12 @@ def _report(args: argparse.Namespace) -> int:
     made = _made(plan, args)  # what is wrong with a cascade, or with the folder, is told now
     if args.output is not None:
         keep_input(args.output / REPORT, _inputs(args))
-        need_matplotlib()
         _make(args.output)
     scores: list[Scores] = []
     recorded: dict[str, list[Outcome]] = {}
     with closing(Live(sys.stderr, None)) as live:
+        if args.output is not None and not plan.pictures:
+            live.tell(f"without matplotlib there will be {REPORT} alone: pip install 'headvox[plot]'")
         scenarios = _scenarios(args, live)
         if plan.tracker is not None and any(scenario.identified for scenario in scenarios):
             need_motmetrics()  # before hours of work, not after
@@ -121,7 +121,7 @@ def _report(args: argparse.Namespace) -> int:
         for scenario, several in outcomes:
             _tell_bad(scenario, several[0], live)
             scores += [entry for outcome in several for entry in outcome.scores]
-            if args.output is not None:
+            if plan.pictures:
                 _picture(scenario, several, plan.rules_of(scenario), args.output)
             for outcome in several:
                 if scenario.recording and (outcome.run.samples[0].found.ids == NO_ID).all():
@@ -153,6 +153,7 @@ def _make(folder: Path) -> None:
 def _plan(args: argparse.Namespace) -> Plan:
     from headvox.evaluate.match import Rules
     from headvox.evaluate.outcome import Plan
+    from headvox.evaluate.plots import can_plot
 
     config = config_of(args)
     return Plan(
@@ -161,7 +162,7 @@ def _plan(args: argparse.Namespace) -> Plan:
         rules=Rules(args.radius, args.clear, args.count_truncated),
         heads=args.heads,
         name=args.name,
-        pictures=args.output is not None,
+        pictures=args.output is not None and can_plot(),
     )
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from headvox.data import F64
-from headvox.errors import MissingExtra
 from headvox.evaluate.match import Rules
 from headvox.evaluate.metrics import Rows, gather, match_frames
 from headvox.evaluate.scores import Scores
@@ -26,12 +25,13 @@ DOTS_PER_INCH = 110
 RECALL_BINS_M = np.arange(0.0, 8.5, 0.5)
 
 
-def need_matplotlib() -> None:
-    """Raise HeadvoxError where matplotlib is not installed."""
+def can_plot() -> bool:
+    """Return whether matplotlib is installed, which draws plots and pictures."""
     try:
         import_module("matplotlib")
     except ImportError:
-        raise MissingExtra("Plots and pictures need matplotlib.", "plot") from None
+        return False
+    return True
 
 
 def plot_scenario(runs: Sequence[tuple[Scores, Run]], rules: Rules, path: Path) -> None:

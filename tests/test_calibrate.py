@@ -181,3 +181,5 @@ def test_bad_input_is_told_in_a_line(tmp_path):
     done = headvox("align", SAMPLE, "--extrinsics", "other.toml", cwd=tmp_path)
     assert done.returncode == 1
     assert "has no camera nobody, only left, right" in done.stderr
+    done = headvox("align", "nothing", "-o", "no/x.toml", cwd=tmp_path)  # before anything is read
+    assert "headvox: error: Output no/x.toml: No such file or directory." in done.stderr

@@ -284,7 +284,7 @@ def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["eval", str(clouds), "--against", "nonsense"]) == 1
     (tmp_path / "file").touch()
     assert main(["eval", str(clouds), "-o", str(tmp_path / "file")]) == 1
-    assert "Cannot make the folder" in capsys.readouterr().err
+    assert f"Output {tmp_path / 'file'}: " in capsys.readouterr().err
     capsys.readouterr()
     (clouds / "heads.jsonl").unlink()
     assert main(["eval", str(clouds)]) == 1

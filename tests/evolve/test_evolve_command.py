@@ -46,4 +46,8 @@ def test_bad_commands_end_before_any_work(tmp_path, monkeypatch, capsys):
     assert main(["masks", "evolve"]) == 1
     assert "exists already" in capsys.readouterr().err
     assert (tmp_path / "evolved.toml").read_text() == "mine"
+    assert main(["masks", "evolve", "-o", "no/x.toml"]) == 1
+    assert "Output no/x.toml: No such file or directory." in capsys.readouterr().err
+    assert main(["masks", "evolve", "-o", "x.toml", "--work", "evolved.toml/work"]) == 1
+    assert "Output evolved.toml/work: Not a directory." in capsys.readouterr().err
     assert main(["masks", "evolve", "--seed", "-1"]) == 2

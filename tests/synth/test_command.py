@@ -107,6 +107,14 @@ def test_what_is_there_is_never_mixed_or_lost(tmp_path, kind):
     assert contents(tmp_path / "mine") == {"letter.txt": b"dear"}
 
 
+@pytest.mark.parametrize("kind", [("heads", "--count", 1), ("walk", "--frames", 1)])
+def test_a_place_that_cannot_be_written_is_named_as_it_was_given(tmp_path, kind):
+    (tmp_path / "file").touch()
+    done = synth(*kind, "-o", tmp_path / "file" / "new")
+    assert done.returncode == 1
+    assert f"headvox: error: Output {tmp_path / 'file' / 'new'}: Not a directory.\n" in done.stderr
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

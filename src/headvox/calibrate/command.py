@@ -24,6 +24,7 @@ from headvox.commands.flags import (
 from headvox.commands.live import Live
 from headvox.commands.table import printable, table
 from headvox.errors import HeadvoxError
+from headvox.writable import check_file
 
 if TYPE_CHECKING:
     from headvox.calibrate.floor import Floor
@@ -58,6 +59,9 @@ def main(argv: Sequence[str]) -> int:
     args = _parser().parse_args(argv)
     from headvox.calibrate.floor import level
 
+    if args.output is not None:
+        keep_input(args.output, [args.source])
+        check_file(args.output)
     with closing(Live(sys.stderr, None)) as live:
         frames = _frames(args, live)
         views = _views(frames)
@@ -66,7 +70,6 @@ def main(argv: Sequence[str]) -> int:
     found = _in_the_world(views, levels, placed)
     _tell(views, placed, found)
     if args.output is not None:
-        keep_input(args.output, [args.source])
         write_text(args.output, extrinsics_text(found))
         print(f"\nwritten to {printable(str(args.output))}")
     return GOOD

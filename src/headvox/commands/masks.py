@@ -85,10 +85,12 @@ def _masks_plot(args: argparse.Namespace) -> int:
 def _masks_evolve(args: argparse.Namespace) -> int:
     from headvox.evolve.search import Settings, evolve
     from headvox.evolve.write import write_cascade
+    from headvox.writable import check_file
 
     out = args.output or Path(f"{args.name}.toml")
     if out.exists():
         raise HeadvoxError(f"{out}: exists already.", "Give another file with -o, or move it away.")
+    check_file(out)
     settings = Settings(args.work, args.views, args.name, args.seed, args.rounds, of_flags(args))
     found = evolve(settings, lambda text: print(text, file=sys.stderr, flush=True))
     write_cascade(out, args.name, found)

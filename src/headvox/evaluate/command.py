@@ -28,9 +28,9 @@ from headvox.commands.flags import (
 )
 from headvox.commands.live import Live
 from headvox.commands.table import file_name, printable
-from headvox.errors import HeadvoxError
 from headvox.parallel.workers import Workers, add_flags, of_flags
 from headvox.sample import sample_folder
+from headvox.writable import make_folder
 
 if TYPE_CHECKING:
     from headvox.evaluate.match import Rules
@@ -99,7 +99,7 @@ def _report(args: argparse.Namespace) -> int:
     made = _made(plan, args)  # what is wrong with a cascade, or with the folder, is told now
     if args.output is not None:
         keep_input(args.output / REPORT, _inputs(args))
-        _make(args.output)
+        make_folder(args.output)
     scores: list[Scores] = []
     recorded: dict[str, list[Outcome]] = {}
     with closing(Live(sys.stderr, None)) as live:
@@ -141,13 +141,6 @@ def _inputs(args: argparse.Namespace) -> list[str | Path | None]:
     """Return the files and folders that are read."""
     places = [what for what in args.what if what not in (*ALL, "all", "peers")]
     return [*places, args.heads, args.clouds, args.config]
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HeadvoxError(f"Cannot make the folder {folder}: {error.strerror}.", "Choose another.") from None
 
 
 def _plan(args: argparse.Namespace) -> Plan:

@@ -40,6 +40,7 @@ from headvox.masks.cascade import Cascade, Condition
 from headvox.masks.compile import CompiledCascade, CompiledGate, compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade
 from headvox.parallel.workers import ALONE, Workers
+from headvox.writable import make_folder
 
 GATE_VIEWS = 3000
 GATE_LOSES, TIGHT_GATE_LOSES = 0.03, 0.004
@@ -185,7 +186,7 @@ def _claim(settings: Settings) -> None:
     if settings.views < 200:
         what = f"--views: expected at least 200, of which 20 are kept aside, got {settings.views}."
         raise HeadvoxError(what, "Thousands are better.")
-    (settings.work / "views").mkdir(parents=True, exist_ok=True)
+    make_folder(settings.work / "views", settings.work)
     note = settings.work / "search.json"
     mine = {"format": "headvox-search", "version": 1, "seed": settings.seed}
     if note.exists() and json.loads(note.read_text(encoding="utf-8")) != mine:

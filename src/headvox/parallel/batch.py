@@ -16,6 +16,7 @@ from headvox.errors import HeadvoxError, Undecided
 from headvox.parallel.workers import Workers
 from headvox.sinks import Result, Sink
 from headvox.sources.options import SourceOptions
+from headvox.writable import make_folder
 
 if TYPE_CHECKING:
     from headvox.run import Report
@@ -73,10 +74,7 @@ def run_batch(
                 f"Two of the sources are called {name}: their results would be one file.",
                 "Run them into folders of their own.",
             )
-    try:
-        settings.into.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HeadvoxError(f"{settings.into}: {error.strerror}.", "Choose another folder.") from None
+    make_folder(settings.into)
     settings = replace(settings, into=settings.into.absolute())
     every = []
     for done in workers.map(partial(run_one, settings=settings), [_absolute(place) for place in places]):

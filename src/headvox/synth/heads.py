@@ -35,6 +35,7 @@ from headvox.synth.bodies import (
 )
 from headvox.synth.rays import NOTHING, Mesh, look
 from headvox.synth.spread import escapes, spread_points
+from headvox.writable import make_folder
 
 EYE_DISTANCE_M = 0.064  # of a normalised head
 RANGES = {"age_years": (8.0, 80.0), "sex": (0.0, 1.0), "mass": (0.15, 0.9), "elongation": (-1.0, 1.0)}
@@ -146,12 +147,7 @@ def make_heads(
     if seed < 0:
         raise HeadvoxError(f"Expected a seed of 0 or more, got {seed}.", "Give a whole number.")
     out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HeadvoxError(
-            f"Cannot make the folder {out}: {error.strerror}.", "Choose another folder."
-        ) from None
+    make_folder(out)
     identities = sample_identities(count, seed)
     settings = {"count": count, "points": points, "metric": metric, "seed": seed}
     _claim(out / "settings.json", settings)

@@ -30,6 +30,7 @@ from headvox.synth.camera import d435i
 from headvox.synth.makers import People
 from headvox.synth.presets import two_cameras
 from headvox.synth.scene import Scene, TrueHead
+from headvox.writable import make_folder
 
 SAMPLE_FRAMES = 24
 SAMPLE_RATE_HZ = 10.0
@@ -102,6 +103,7 @@ def _write(
     if not stamps_ns or any(b <= a for a, b in pairwise(stamps_ns)):
         raise HeadvoxError("Expected at least one stamp, each later than the one before.", "Sort the stamps.")
     partial_folder = folder.with_name(folder.name + ".partial")
+    make_folder(partial_folder, folder)
     _begin(partial_folder, _making(scene, stamps_ns))
     truth = partial_folder / "truth"
     for place in (truth, *(partial_folder / camera.name for camera in scene.cameras)):
@@ -141,9 +143,8 @@ def _making(scene: Scene, stamps_ns: Sequence[int]) -> dict[str, Any]:
 
 
 def _begin(folder: Path, making: dict[str, Any]) -> None:
-    """Make the folder, or go on with it when the same recording was begun there."""
+    """Claim the folder, or go on with it when the same recording was begun there."""
     note = folder / "making.json"
-    folder.mkdir(parents=True, exist_ok=True)
     if not note.exists() and not any(folder.iterdir()):
         write_text(note, json.dumps(making))
     elif not note.exists() or json.loads(note.read_text(encoding="utf-8")) != making:

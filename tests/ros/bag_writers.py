@@ -83,15 +83,16 @@ class Maker:
         return kinds["tf2_msgs/msg/TFMessage"]([stamped])
 
 
-def write_bag(folder: Path, kind: str, messages: list[Message], name: str = "rig") -> Path:
-    """Write messages, made by a Maker that fits the kind, and return the path of the bag."""
+def write_bag(
+    folder: Path, kind: str, messages: list[Message], name: str = "rig", chunk_bytes: int = 1 << 20
+) -> Path:
+    """Write messages, made by a Maker that fits the kind, and return the path; only bare MCAPs heed chunk_bytes."""
     kind, _, compression = kind.partition("-")
     if kind == "ros1":
         return _write_ros1(folder / f"{name}.bag", compression, messages)
     if kind == "bare":
-        return _write_bare(
-            folder / f"{name}.mcap", compression.removeprefix("mcap").removeprefix("-"), messages
-        )
+        compression = compression.removeprefix("mcap").removeprefix("-")
+        return _write_bare(folder / f"{name}.mcap", compression, messages, chunk_bytes)
     plugin = {"db3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}[kind]
     writer = rosbag2.Writer(folder / name, version=9, storage_plugin=plugin)
     if compression:
@@ -123,11 +124,14 @@ def _write_ros1(path: Path, compression: str, messages: list[Message]) -> Path:
     return path
 
 
-def _write_bare(path: Path, compression: str, messages: list[Message]) -> Path:
+def _write_bare(path: Path, compression: str, messages: list[Message], chunk_bytes: int) -> Path:
     kinds = {"": "NONE", "flat": "NONE", "zstd": "ZSTD", "lz4": "LZ4"}
     with path.open("wb") as file:
         writer = Writer(
-            file, compression=CompressionType[kinds[compression]], use_chunking=compression != "flat"
+            file,
+            chunk_bytes,
+            compression=CompressionType[kinds[compression]],
+            use_chunking=compression != "flat",
         )
         writer.start("ros2", "a test")
         topics = {}

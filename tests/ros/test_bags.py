@@ -347,6 +347,27 @@ def test_a_damaged_bag_is_read_or_refused(tmp_path, kind):
     assert Frame in outcomes or kind in ("db3-file", "mcap-storage")
 
 
+@pytest.mark.parametrize("moving", [False, True])
+def test_frames_before_a_damaged_chunk_are_read(tmp_path, moving):
+    messages = rig(Maker(), 6, moving=moving)
+    place = write_bag(tmp_path, "bare-mcap-zstd", messages, chunk_bytes=16 << 10)
+    data = bytearray(place.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 40] = bytes(40)
+    place.write_bytes(data)
+    source, notes = opened(place)
+    assert sum("is damaged" in note and "mcap recover" in note for note in notes) == moving
+    *frames, last = source
+    assert 1 <= sum(isinstance(frame, Frame) for frame in frames) < 6
+    assert isinstance(last, BadFrame)
+    assert "the bag is damaged" in last.reason
+
+
+def test_a_transform_that_is_damaged_refuses_no_bag(tmp_path):
+    messages = [*rig(Maker()), ("/tf_static", START, b"\x00\x01\x00\x00garbage")]
+    assert len(list(opened(write_bag(tmp_path, "mcap", messages))[0])) == 3
+
+
 def test_a_small_bag_cannot_fill_the_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(bagfile, "MOST_UNPACKED_BYTES", 1 << 20)
     monkeypatch.setattr(bagfile, "_MOST_EXPANSION", 1)

@@ -73,7 +73,7 @@ class Bag:
             for connection in self._connections:
                 counts[connection.topic] += connection.msgcount
         except Exception as error:  # a damaged bag makes rosbags raise almost anything
-            raise _damaged(self.name, error) from None
+            raise _damaged(self.name, self.kind, error) from None
         self.topics = {name: Topic(name, kind, counts[name]) for name, kind in sorted(kinds.items())}
         self._open = True
 
@@ -90,7 +90,7 @@ class Bag:
             for connection, logged_ns, data in self._reader.messages(connections):
                 yield connection.topic, logged_ns, data
         except Exception as error:
-            raise _damaged(self.name, error) from None
+            raise _damaged(self.name, self.kind, error) from None
 
     def decode(self, topic: str, data: bytes) -> Any:
         """Return a message, with the field names of ROS 2.
@@ -141,7 +141,7 @@ def _reader(rosbags: SimpleNamespace, place: Path) -> tuple[str, Any]:
     raise HeadvoxError(f"{place.name}: expected a bag, it begins with {head[:12]!r}.", "Is it one?")
 
 
-def _damaged(name: str, error: Exception) -> HeadvoxError:
+def _damaged(name: str, kind: str, error: Exception) -> HeadvoxError:
     """Say what is wrong with a bag as a whole."""
     if isinstance(error, HeadvoxError):
         return error
@@ -153,7 +153,8 @@ def _damaged(name: str, error: Exception) -> HeadvoxError:
         )
     if "not indexed" in reason:
         return HeadvoxError(f"{name}: the bag has no index: it was not closed.", "Repair it: rosbag reindex")
-    return HeadvoxError(f"{name}: the bag cannot be read: {reason}.", "Is it complete?")
+    do = "More of it may be got back with: mcap recover" if kind == "MCAP" else "Is it complete?"
+    return HeadvoxError(f"{name}: the bag is damaged: {reason}.", do)
 
 
 def _one_line(error: Exception) -> str:

@@ -65,7 +65,7 @@ class BagSource:
         self.name = self.bag.name
         try:
             self.sensors = find_sensors(self.bag, options)
-            self._transforms, known = known_transforms(self.bag)
+            self._transforms, known = known_transforms(self.bag, say)
             if not options.topics:
                 check_apart(self.name, self.sensors, known, self._first_stamps())
             self.placing = place(self.name, self.sensors, known, options)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, islice
+from typing import Any
 
 import numpy as np
 
@@ -131,18 +133,36 @@ def _camera_of(bag: Bag, topic: str, frame: str, size: tuple[int, int]) -> Intri
 # ------------------------------------------------------------------------------------------------------- frames
 
 
-def known_transforms(bag: Bag) -> tuple[TransformBuffer, TransformBuffer]:
-    """Return the static transforms, and those with what /tf begins with: enough to know which frames there are."""
+def known_transforms(bag: Bag, say: Callable[[str], None]) -> tuple[TransformBuffer, TransformBuffer]:
+    """Return the static transforms, and those with what /tf begins with: enough to know which frames there are.
+
+    Where the bag is damaged they end: ``say`` is told.
+    """
     static, begun = TransformBuffer(), TransformBuffer(keep_s=1e6)
     topics = transform_topics(bag)
+    told: set[str] = set()
     for is_static in (True, False):
         chosen = {name for name in topics if ("static" in name) == is_static}
-        for looked_at, (topic, _, data) in enumerate(bag.messages(chosen)):
-            if looked_at >= _LOOKED_AT:
-                break
-            for buffer in (static, begun) if is_static else (begun,):
-                set_from(buffer, bag.decode(topic, data), is_static)
+        try:
+            for message in islice(_readable(bag, chosen), _LOOKED_AT):
+                for buffer in (static, begun) if is_static else (begun,):
+                    set_from(buffer, message, is_static)
+        except HeadvoxError as error:
+            told.add(f"{error.what} What stands before that is read. {error.do}")
+    for text in sorted(told):
+        say(text)
     return static, begun
+
+
+def _readable(bag: Bag, topics: set[str]) -> Iterator[Any]:
+    """Yield the messages of these topics, but those that are damaged.
+
+    Raises:
+        HeadvoxError: the bag is damaged from here on.
+    """
+    for topic, _, data in bag.messages(topics):
+        with suppress(HeadvoxError):
+            yield bag.decode(topic, data)
 
 
 def transform_topics(bag: Bag) -> set[str]:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from headvox.commands.live import Live
 from headvox.commands.table import printable, table
+from headvox.config import TrackerConfig
 from headvox.data import Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.run import Report
@@ -105,6 +106,17 @@ def test_csv_has_a_row_a_head(tmp_path: Path) -> None:
         "frame,stamp_ns,latency_ms,id,x,y,z,qx,qy,qz,qw,radius,score,vx,vy,vz,state\n"
         "7,123456789012345678,2.1,,1.0,-2.0,0.0,0.0,0.0,0.6,0.8,0.11,3.25,,,,\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "told"),
+    [(1_500_000_000, "1.500000000"), (-1, "-0.000000001"), (1 - 10**18, "-999999999.999999999")],
+)
+def test_trajectories_have_stamps_before_1970(tmp_path: Path, stamp_ns: int, told: str) -> None:
+    tracker = Tracker(TrackerConfig(confirm_hits=1, strong_score=1.0))
+    result = Result(0, stamp_ns, 1.0, HEADS, tracker.update(HEADS, Frame(stamp_ns)))
+    open_sink(tmp_path / "out.tum").write(result)
+    assert (tmp_path / "out_1.tum").read_text().split()[0] == told
 
 
 def test_a_stream_is_not_closed() -> None:

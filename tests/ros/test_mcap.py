@@ -80,6 +80,19 @@ def test_two_cameras_of_the_simulation_are_the_same_heads_through_a_bag(tmp_path
         np.testing.assert_allclose(a.tracks.centres, b.tracks.centres, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9, 2**62])
+def test_a_stamp_that_ros_cannot_have_is_explained(tmp_path, stamp_ns):
+    with pytest.raises(HeadvoxError, match=rf"expected stamps from 0 to 2\^31 s.* got {stamp_ns} ns"):
+        convert(Listed(Frame(0), Frame(stamp_ns)), tmp_path / "a.mcap")
+    assert [stamp for _, stamp, _ in read(tmp_path / "a.mcap")] == [0]
+
+
+def test_the_last_stamp_of_ros_comes_back(tmp_path):
+    last = 2**31 * 10**9 - 1
+    convert(Listed(Frame(last, (Cloud("x", POINTS, np.eye(4)),))), tmp_path / "a.mcap")
+    assert [frame.stamp_ns for frame in open_source(tmp_path / "a.mcap")] == [last]
+
+
 def test_clouds_and_other_scales_come_back(tmp_path):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], (1.0, 2.0, 3.0)

@@ -13,9 +13,11 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from headvox.errors import HeadvoxError, MissingExtra
-from headvox.ros.outputs import Content
+from headvox.ros.outputs import NS, Content
 from headvox.writable import check_file
 
+# A builtin_interfaces/Time has 32 bits of seconds, with sign; an MCAP has no time before 1970.
+STAMPS_END_NS = (1 << 31) * NS
 CHUNK_BYTES = 256 << 10  # what is lost at most when the process is killed
 # vision_msgs is in no distribution's common messages: these are its definitions in ROS 2 Humble and later.
 _VISION = {
@@ -59,8 +61,13 @@ class McapFile:
         """Write a message of a type such as ``geometry_msgs/msg/PoseArray``, recorded at its own stamp.
 
         Raises:
-            HeadvoxError: the disk is full.
+            HeadvoxError: ROS cannot have that stamp, or the disk is full.
         """
+        if not 0 <= stamp_ns < STAMPS_END_NS:
+            raise HeadvoxError(
+                f"Output {self.path}: expected stamps from 0 to 2^31 s, as ROS has them, got {stamp_ns} ns.",
+                "Correct the stamps, or write a file of another kind.",
+            )
         message = message_of(self._store, kind, content)
         data = bytes(self._store.serialize_cdr(message, kind))
         with self._whole():

@@ -50,7 +50,8 @@ class TumFiles:
 
 
 def _line(stamp_ns: int, row: Track) -> str:
-    seconds, rest = divmod(stamp_ns, 1_000_000_000)
+    seconds, rest = divmod(abs(stamp_ns), 1_000_000_000)
+    sign = "-" if stamp_ns < 0 else ""
     place = " ".join(f"{value + 0.0:.{METRE_DIGITS}f}" for value in row.centre)
     turn = " ".join(f"{value + 0.0:.{DIGITS}f}" for value in row.quaternion)
-    return f"{seconds}.{rest:09d} {place} {turn}"
+    return f"{sign}{seconds}.{rest:09d} {place} {turn}"

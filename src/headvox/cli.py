@@ -13,7 +13,6 @@ import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path
 
 from headvox import __version__
 from headvox.commands import completion, doctor
@@ -33,6 +32,7 @@ from headvox.commands.flags import (
     config_of,
     keep_input,
     named,
+    place,
     source_options_of,
     tracker_config_of,
 )
@@ -161,10 +161,14 @@ def _convert(args: argparse.Namespace) -> int:
     from headvox.commands.live import Live
     from headvox.remarks import Remarks
     from headvox.sources import open_source
+    from headvox.sources.remote import fetched
 
     notes: list[str] = []
-    with closing(open_source(args.source, source_options_of(args), notes.append)) as source:
-        keep_input(args.output, [args.source])
+    with (
+        fetched(args.source) as path,
+        closing(open_source(path, source_options_of(args), notes.append)) as source,
+    ):
+        keep_input(args.output, [path])
         with closing(Live(sys.stderr, source.length)) as live, closing(Remarks(live.tell)) as remarks:
             for note in notes:
                 live.tell(note)
@@ -186,9 +190,12 @@ def _convert(args: argparse.Namespace) -> int:
 
 def _info(args: argparse.Namespace) -> int:
     from headvox.sources.describe import describe
+    from headvox.sources.remote import fetched
 
     notes: list[str] = []
-    print(table([], [list(row) for row in describe(args.source, source_options_of(args), notes.append)]))
+    with fetched(args.source) as path:
+        rows = describe(path, source_options_of(args), notes.append)
+    print(table([], [list(row) for row in rows]))
     for note in notes:
         _complain(note, "")
     return GOOD
@@ -241,13 +248,13 @@ def _parser() -> argparse.ArgumentParser:
 
     run_command.add_to(commands)
     info = add_command(commands, "info", _info, "tell what a source holds")
-    info.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
+    info.add_argument("source", type=place, metavar="SOURCE", help="as for run")
     add_source_options(info)
 
     conversion = add_command(
         commands, "convert", _convert, "write a recording, or any source, as a bag (MCAP)"
     )
-    conversion.add_argument("source", type=Path, metavar="SOURCE", help="as for run")
+    conversion.add_argument("source", type=place, metavar="SOURCE", help="as for run")
     conversion.add_argument(
         "-o",
         dest="output",

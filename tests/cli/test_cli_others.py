@@ -63,6 +63,14 @@ def test_a_conversion_tells_which_frames_it_leaves_out_and_why(tmp_path: Path) -
     assert bag.read_bytes() == before
 
 
+def test_info_and_convert_take_addresses(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    assert headvox("info", f"file://{recording}").stdout == headvox("info", recording).stdout
+    for source, name in ((f"file://{recording}", "fetched.mcap"), (recording, "here.mcap")):
+        assert headvox("convert", source, "-o", tmp_path / name).returncode == 0
+    assert (tmp_path / "fetched.mcap").read_bytes() == (tmp_path / "here.mcap").read_bytes()
+
+
 def test_masks_are_listed_and_shown(anything: Path) -> None:
     assert {line.split()[0] for line in headvox("masks", "list").stdout.splitlines()} >= {"default"}
     shown = headvox("masks", "show", anything).stdout

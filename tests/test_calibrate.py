@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +14,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from headvox.calibrate.command import extrinsics_text
+from headvox.calibrate.command import extrinsics_text, spread_frames
 from headvox.calibrate.floor import camera_points, find_floor, level, stated, wrong_floor
 from headvox.calibrate.rig import place
+from headvox.commands.convert import convert
 from headvox.data import Frame
 from headvox.errors import HeadvoxError
 from headvox.frames import inverse, transform
@@ -163,6 +165,15 @@ def test_the_rig_of_the_sample_is_found_again_from_nothing(tmp_path):
     frame = next(iter(source))
     assert isinstance(frame, Frame)
     assert np.array_equal(frame.depths[0].T_world_camera, found["left"])
+
+
+def test_frames_are_spread_over_the_whole_of_a_bag_of_several_cameras(tmp_path):
+    convert(open_source(SAMPLE), tmp_path / "rig.mcap")
+    every = [frame.stamp_ns for frame in open_source(SAMPLE)]
+    for path in (SAMPLE, tmp_path / "rig.mcap"):
+        with closing(open_source(path)) as source:
+            chosen = spread_frames(source, 5, print)
+        assert [frame.stamp_ns for frame in chosen] == every[::5]
 
 
 def _options(file: Path):

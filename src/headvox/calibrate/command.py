@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from headvox.calibrate.floor import Floor
     from headvox.calibrate.rig import Placed
     from headvox.data import F64, DepthImage, Frame
+    from headvox.sources import Source
 
 MOST_FRAMES = 200
 FLOOR_FRAMES = 8
@@ -58,12 +59,18 @@ def main(argv: Sequence[str]) -> int:
     """Run ``headvox align`` with these arguments and return the exit code."""
     args = _parser().parse_args(argv)
     from headvox.calibrate.floor import level
+    from headvox.sources import open_source
+    from headvox.sources.remote import fetched
 
     if args.output is not None:
         keep_input(args.output, [args.source])
         check_file(args.output)
     with closing(Live(sys.stderr, None)) as live:
-        frames = _frames(args, live)
+        with (
+            fetched(args.source) as path,
+            closing(open_source(path, source_options_of(args), live.note)) as source,
+        ):
+            frames = spread_frames(source, args.frames, live.show)
         views = _views(frames)
         levels = {view.name: level(view.floor) for view in views}
         placed = _place_others(views, levels, live)
@@ -75,28 +82,34 @@ def main(argv: Sequence[str]) -> int:
     return GOOD
 
 
-def _frames(args: argparse.Namespace, live: Live) -> list[Frame]:
-    """Return at most MOST_FRAMES good frames, evenly over the source where its length is known."""
+def spread_frames(source: Source, most: int, show: Callable[[str], None]) -> list[Frame]:
+    """Return at most ``most`` good frames, evenly over the source where its length is known; ``show`` is told.
+
+    Raises:
+        HeadvoxError: there is none with a depth image.
+    """
     from headvox.data import BadFrame
-    from headvox.sources import open_source
-    from headvox.sources.remote import fetched
 
     frames: list[Frame] = []
-    with (
-        fetched(args.source) as path,
-        closing(open_source(path, source_options_of(args), live.note)) as source,
-    ):
-        step = max(1, -(-(source.length or 0) // args.frames))
-        for number, frame in enumerate(source):
-            live.show(f"reading frame {number + 1}")
-            if number % step == 0 and not isinstance(frame, BadFrame) and frame.depths:
-                frames.append(frame)
-            if len(frames) == args.frames:
-                break
-        name = source.name
+    step = max(1, -(-_about_length(source) // most))
+    for number, frame in enumerate(source):
+        show(f"reading frame {number + 1}")
+        if number % step == 0 and not isinstance(frame, BadFrame) and frame.depths:
+            frames.append(frame)
+        if len(frames) == most:
+            break
     if not frames:
-        raise HeadvoxError(f"{name}: there are no depth images in it.", "Clouds alone cannot be aligned.")
+        raise HeadvoxError(
+            f"{source.name}: there are no depth images in it.", "Clouds alone cannot be aligned."
+        )
     return frames
+
+
+def _about_length(source: Source) -> int:
+    """Return about how many frames there are, 0 where nobody knows."""
+    from headvox.sources.bag import BagSource
+
+    return source.most_readings if isinstance(source, BagSource) else source.length or 0
 
 
 def _views(frames: list[Frame]) -> list[View]:

@@ -88,6 +88,11 @@ class BagSource:
             return "world"  # that of --mount, which the bag has no name for
         return placing.frame or self.sensors[0].frame
 
+    @property
+    def most_readings(self) -> int:
+        """How many the sensor with the most has: about as many frames as there are."""
+        return max(self.bag.topics[sensor.topic].count for sensor in self.sensors)
+
     def _first_stamps(self) -> dict[str, int]:
         return {s.topic: stamp_ns(self.bag.first(s.topic).header.stamp) for s in self.sensors}
 

@@ -188,6 +188,12 @@ def test_bad_input_is_told_in_a_line(tmp_path):
     done = headvox("align", "cloud.npy", cwd=tmp_path)
     assert done.returncode == 1
     assert "there are no depth images in it" in done.stderr
+    described = (SAMPLE / "recording.json").read_text()
+    (tmp_path / "recording.json").write_text(described)  # without its images
+    done = headvox("align", ".", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "24 of its frames are bad, and no other can be used" in done.stderr
+    assert "000000.png: cannot be read: No such file" in done.stderr
     (tmp_path / "other.toml").write_text(extrinsics_text({"nobody": np.eye(4)}))
     done = headvox("align", SAMPLE, "--extrinsics", "other.toml", cwd=tmp_path)
     assert done.returncode == 1

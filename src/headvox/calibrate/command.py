@@ -91,13 +91,20 @@ def spread_frames(source: Source, most: int, show: Callable[[str], None]) -> lis
     from headvox.data import BadFrame
 
     frames: list[Frame] = []
+    bad, why = 0, ""
     step = max(1, -(-_about_length(source) // most))
     for number, frame in enumerate(source):
         show(f"reading frame {number + 1}")
-        if number % step == 0 and not isinstance(frame, BadFrame) and frame.depths:
+        if isinstance(frame, BadFrame):
+            bad, why = bad + 1, why or frame.reason
+        elif number % step == 0 and frame.depths:
             frames.append(frame)
         if len(frames) == most:
             break
+    if not frames and bad:
+        raise HeadvoxError(
+            f"{source.name}: {bad} of its frames are bad, and no other can be used.", f"The first: {why}"
+        )
     if not frames:
         raise HeadvoxError(
             f"{source.name}: there are no depth images in it.", "Clouds alone cannot be aligned."

@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import closing
+from typing import TextIO
 
 from headvox import __version__
 from headvox.commands import completion, doctor
@@ -82,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(arguments: list[str]) -> int:
     debug = "--debug" in arguments
+    _open_streams()
     try:
         with heeded():
             code = _dispatch(arguments)
@@ -101,6 +103,16 @@ def _main(arguments: list[str]) -> int:
             return USAGE
         return KNOWN_ERROR
     return code
+
+
+def _open_streams() -> None:
+    """Let what is printed go nowhere where a stream was closed before we began, as daemons have it."""
+    sys.stdout = sys.stdout or _nowhere()
+    sys.stderr = sys.stderr or _nowhere()
+
+
+def _nowhere() -> TextIO:
+    return open(os.devnull, "w", encoding="utf-8")
 
 
 def _dispatch(arguments: list[str]) -> int:

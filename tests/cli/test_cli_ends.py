@@ -59,6 +59,20 @@ def test_a_closed_pipe_ends_quietly(recording: Path) -> None:
     os.close(writing)
 
 
+@pytest.mark.parametrize(("closed", "told"), [(">&-", "stderr"), ("2>&-", "stdout")])
+def test_a_closed_stream_spoils_nothing(recording: Path, closed: str, told: str) -> None:
+    for arguments in (f"run {recording} --json", "config", "--version", "run nothing"):
+        shown = subprocess.run(
+            [str(COMMAND), *arguments.split()], capture_output=True, text=True, check=False
+        )
+        done = subprocess.run(
+            f"{COMMAND} {arguments} {closed}", shell=True, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == shown.returncode
+        assert done.stdout.count("\n") == (shown.stdout.count("\n") if told == "stdout" else 0)
+        assert done.stderr == (shown.stderr if told == "stderr" else "")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full exists on Linux only")
 def test_a_full_disk_is_explained(recording: Path) -> None:
     with open("/dev/full", "w") as full:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import sys
 import traceback
@@ -83,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(arguments: list[str]) -> int:
     debug = "--debug" in arguments
-    _open_streams()
+    _prepare_streams()
     try:
         with heeded():
             code = _dispatch(arguments)
@@ -105,10 +106,15 @@ def _main(arguments: list[str]) -> int:
     return code
 
 
-def _open_streams() -> None:
-    """Let what is printed go nowhere where a stream was closed before we began, as daemons have it."""
+def _prepare_streams() -> None:
+    """Let what is printed go nowhere where a stream was closed before we began, as daemons have it.
+
+    Letters that the terminal does not know are printed as "?"; on standard error Python sees to that.
+    """
     sys.stdout = sys.stdout or _nowhere()
     sys.stderr = sys.stderr or _nowhere()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
 
 
 def _nowhere() -> TextIO:

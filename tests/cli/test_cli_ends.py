@@ -73,6 +73,21 @@ def test_a_closed_stream_spoils_nothing(recording: Path, closed: str, told: str)
         assert done.stderr == (shown.stderr if told == "stderr" else "")
 
 
+def test_letters_that_the_terminal_does_not_know_are_question_marks(recording: Path) -> None:
+    shown, done = (
+        subprocess.run(
+            [str(COMMAND), "info", str(recording)],
+            env={**os.environ, "PYTHONIOENCODING": encoding},
+            capture_output=True,
+            check=False,
+        )
+        for encoding in ("utf-8", "ascii")
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert "tilted 0.0°" in shown.stdout.decode()
+    assert done.stdout.decode("ascii") == shown.stdout.decode().replace("°", "?")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full exists on Linux only")
 def test_a_full_disk_is_explained(recording: Path) -> None:
     with open("/dev/full", "w") as full:

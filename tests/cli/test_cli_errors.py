@@ -113,6 +113,8 @@ def test_a_cloud_far_away_says_so(tmp_path: Path) -> None:
         ("run", "--threads", "0"),
         ("run", "--threads", "1000"),
         ("run", "--limit", "0"),
+        ("run", "--limit", "99999999999999999999"),
+        ("render", "-o", "a.png", "--at", "9223372036854775807"),
         ("run", "--refine", "magic"),
         ("config", "--voxel", "7"),
         ("info",),

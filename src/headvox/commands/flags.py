@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -203,7 +204,7 @@ def add_tracker_settings(parser: argparse.ArgumentParser) -> None:
         tracker.add_argument(flag, dest=name, type=kind, metavar=metavar, help=text)
 
 
-# argparse names these three in its messages: "invalid number value: 'x'".
+# argparse names these in its messages: "invalid number value: 'x'", "invalid whole_number value: 'x'".
 
 
 def number(text: str) -> float:
@@ -214,21 +215,22 @@ def number(text: str) -> float:
     return value
 
 
-def whole_number(text: str) -> int:
-    """Return the whole number, at least 1, that ``text`` is."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected at least 1, got {text!r}")
-    return value
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """Return what reads a whole number within limits, for argparse."""
+
+    def whole_number(text: str) -> int:
+        value = int(text)
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"expected {least} to {most}, got {text!r}")
+        return value
+
+    return whole_number
 
 
-def seed_number(text: str) -> int:
-    """Return the whole number, at least 0, that ``text`` is."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"expected at least 0, got {text!r}")
-    return value
-
+whole_number = whole(1, 1_000_000_000)
+"""Reads how many of something."""
+seed_number = whole(0, sys.maxsize - 1)
+"""Reads the number of a frame, or what random numbers begin with."""
 
 TRACKER_FLAGS = (
     (

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from headvox.commands.flags import seed_number, whole, whole_number
 from headvox.commands.live import Live
 from headvox.commands.table import printable, table
 from headvox.parallel.workers import add_flags, of_flags
@@ -156,8 +157,8 @@ def _parser() -> argparse.ArgumentParser:
     heads = _kind(
         kinds, "heads", _heads, "the paper's data set: bald heads as clouds of evenly spread points"
     )
-    heads.add_argument("--count", type=whole(1), default=44, metavar="N", help="how many people (44)")
-    heads.add_argument("--points", type=whole(1), default=9000, metavar="N", help="of each cloud (9000)")
+    heads.add_argument("--count", type=whole_number, default=44, metavar="N", help="how many people (44)")
+    heads.add_argument("--points", type=whole_number, default=9000, metavar="N", help="of each cloud (9000)")
     heads.add_argument(
         "--metric", action="store_true", help="keep real sizes; else all have 64 mm between the eyes"
     )
@@ -216,22 +217,9 @@ def _add_recording(parser: argparse.ArgumentParser, sensors: Sequence[str]) -> N
 def _add_making(parser: argparse.ArgumentParser, seeded: bool = True) -> None:
     if seeded:
         parser.add_argument(
-            "--seed", type=whole(0), default=0, metavar="N", help="another number, others (0)"
+            "--seed", type=seed_number, default=0, metavar="N", help="another number, others (0)"
         )
     add_flags(parser)
-
-
-def whole(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Return what reads a whole number within limits, for argparse."""
-
-    def whole_number(text: str) -> int:
-        value = int(text)
-        if value < least or (most is not None and value > most):
-            limits = f"at least {least}" if most is None else f"{least} to {most}"
-            raise argparse.ArgumentTypeError(f"expected {limits}, got {text!r}")
-        return value
-
-    return whole_number
 
 
 def rate(text: str) -> float:

@@ -26,6 +26,7 @@ from headvox.commands.flags import (
     KNOWN_ERROR,
     TERMINATED,
     USAGE,
+    Parser,
     UsageError,
     add_command,
     add_settings,
@@ -253,13 +254,12 @@ def _warmup(args: argparse.Namespace) -> int:
 # -------------------------------------------------------------------------------------------------- flags
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         "headvox",
         description=DESCRIPTION,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"headvox {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -301,7 +301,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _whole_parser() -> argparse.ArgumentParser:
+def _whole_parser() -> Parser:
     """Return the parser of the command line, with those of the commands that read their own flags in it."""
     parser = _parser()
     commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))

@@ -40,6 +40,15 @@ def test_flags_beat_the_file_and_the_file_beats_the_defaults(tmp_path: Path) -> 
     assert headvox("config", "--config", again).stdout == done.stdout
 
 
+def test_a_negative_number_may_have_an_exponent(recording: Path) -> None:
+    assert "\nmin_score = -100000.0\n" in headvox("config", "--min-score", "-1e5").stdout
+    place = ("0", "0", "-1.5e-3", "0", "-.5", "0")
+    assert "mount" in headvox("info", recording, "--mount", *place).stderr  # read, and not for recordings
+    assert headvox("synth", "walk", "-o", "x", "--hz", "-1e3").stderr.endswith(
+        "expected 0.01 to 1000, got '-1e3'\n"
+    )
+
+
 def test_info_tells_what_is_there(recording: Path) -> None:
     done = headvox("info", recording)
     assert done.returncode == 0, done.stderr

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 
 from headvox.bench.measure import MAX_RANGE_M, measure
 from headvox.bench.report import report
-from headvox.commands.flags import whole_number
+from headvox.commands.flags import Parser, whole_number
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         "headvox bench",
         description="Measure how fast headvox is on this machine. It makes its own input.",
         epilog="Close what else runs: two threads on two busy cores are slower than one.",
-        allow_abbrev=False,
     )
     parser.add_argument("--cascade", default="default", metavar="NAME|FILE", help="which masks (default)")
     parser.add_argument(

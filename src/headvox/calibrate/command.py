@@ -15,6 +15,7 @@ import numpy as np
 from headvox.atomic import write_text
 from headvox.commands.flags import (
     GOOD,
+    Parser,
     add_source_options,
     keep_input,
     place,
@@ -232,13 +233,12 @@ def extrinsics_text(found: dict[str, F64]) -> str:
     return "\n".join(parts)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         "headvox align",
         description="Tell where the cameras of a recording stand: the floor of each, and of several their places.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument(
         "source", type=place, metavar="SOURCE", help="a depth recording, or a bag with depth images"

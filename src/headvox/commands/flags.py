@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from headvox.errors import HeadvoxError
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from headvox.config import Config, DetectorConfig, TrackerConfig
     from headvox.sources.options import SourceOptions
 
-    Commands = argparse._SubParsersAction[argparse.ArgumentParser]
+    Commands = argparse._SubParsersAction["Parser"]
     Command = Callable[[argparse.Namespace], int]
 
 GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED, TERMINATED = 0, 1, 2, 3, 130, 143
@@ -24,6 +25,15 @@ GOOD, KNOWN_ERROR, USAGE, LIMIT_MISSED, INTERRUPTED, TERMINATED = 0, 1, 2, 3, 13
 
 class UsageError(Exception):
     """The flags do not go together."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Reads flags by their whole names; -1e-3 is a number, which older versions of argparse take for a flag."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.allow_abbrev = False
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
 
 def config_of(args: argparse.Namespace) -> DetectorConfig:
@@ -85,11 +95,9 @@ def keep_input(output: Path, inputs: Sequence[str | Path | None]) -> None:
             )
 
 
-def add_command(commands: Commands, name: str, function: Command, text: str) -> argparse.ArgumentParser:
+def add_command(commands: Commands, name: str, function: Command, text: str) -> Parser:
     """Add a command that is done by ``function``, and return its parser."""
-    parser = commands.add_parser(
-        name, help=text, description=text[0].upper() + text[1:] + ".", allow_abbrev=False
-    )
+    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     parser.set_defaults(command=function, parser=parser)
     return parser

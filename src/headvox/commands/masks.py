@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def add_to(commands: Commands) -> None:
     """Add ``headvox masks`` to the command line."""
-    masks = commands.add_parser("masks", help="list, show and plot cascades of masks", allow_abbrev=False)
+    masks = commands.add_parser("masks", help="list, show and plot cascades of masks")
     actions = masks.add_subparsers(title="commands", metavar="COMMAND", required=True)
     add_command(actions, "list", _masks_list, "list the cascades that ship with headvox")
     cascade = "name of a shipped cascade, or a cascade file"

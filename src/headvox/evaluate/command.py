@@ -17,6 +17,7 @@ from headvox import __version__
 from headvox.commands.flags import (
     GOOD,
     LIMIT_MISSED,
+    Parser,
     UsageError,
     add_settings,
     config_of,
@@ -75,9 +76,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _compare(argv: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(
-        "headvox eval compare", description="Show what differs between two reports.", allow_abbrev=False
-    )
+    parser = Parser("headvox eval compare", description="Show what differs between two reports.")
     for name in ("old", "new"):
         parser.add_argument(
             name, type=Path, metavar=f"{name.upper()}.json", help="report.json of `headvox eval -o`"
@@ -265,13 +264,12 @@ def _picture(scenario: Scenario, outcomes: Sequence[Outcome], rules: Rules, fold
 # -------------------------------------------------------------------------------------------------- flags
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         "headvox eval",
         description="Measure how good the detector is, where the true heads are known.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.usage = "%(prog)s WHAT [WHAT ...] [flags]\n       %(prog)s compare OLD.json NEW.json"
     parser.add_argument("what", nargs="+", metavar="WHAT", help="see below")

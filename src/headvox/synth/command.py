@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from headvox.commands.flags import seed_number, whole, whole_number
+from headvox.commands.flags import Parser, seed_number, whole, whole_number
 from headvox.commands.live import Live
 from headvox.commands.table import printable, table
 from headvox.parallel.workers import add_flags, of_flags
@@ -144,13 +144,12 @@ def _tell(folder: Path, rows: list[tuple[str, str]], progress: _Progress) -> Non
 # -------------------------------------------------------------------------------------------------- flags
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         "headvox synth",
         description="Make people, heads and recordings, and know exactly where every head is.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     kinds = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
@@ -186,14 +185,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _kind(
-    kinds: argparse._SubParsersAction[argparse.ArgumentParser],
+    kinds: argparse._SubParsersAction[Parser],
     name: str,
     function: Callable[[argparse.Namespace], None],
     text: str,
-) -> argparse.ArgumentParser:
-    parser = kinds.add_parser(
-        name, help=text, description=text[0].upper() + text[1:] + ".", allow_abbrev=False
-    )
+) -> Parser:
+    parser = kinds.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     parser.add_argument("-o", dest="out", type=Path, required=True, metavar="DIR", help="a new folder")
     parser.set_defaults(command=function, parser=parser)
     return parser

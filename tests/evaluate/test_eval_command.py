@@ -275,7 +275,10 @@ def test_without_motmetrics_nothing_is_begun_that_needs_it(
 def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval"]) == 2
     assert main(["eval", "static", "--heads", "x.jsonl"]) == 2
-    assert main(["eval", str(clouds), "--radius", "-1"]) == 2
+    for radius in ("-1", "0", "11"):
+        assert main(["eval", str(clouds), "--radius", radius]) == 2
+    for revolutions in ("0", "1e9"):
+        assert main(["eval", "rotation", "--revolutions", revolutions]) == 2
     assert main(["eval", str(clouds), "--max-range", "-1"]) == 2
     assert main(["eval", "static", "--seed", "-1"]) == 2
     capsys.readouterr()

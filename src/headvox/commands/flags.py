@@ -223,6 +223,18 @@ def number(text: str) -> float:
     return value
 
 
+def between(least: float, most: float) -> Callable[[str], float]:
+    """Return what reads a number within limits, for argparse."""
+
+    def limited_number(text: str) -> float:
+        value = number(text)
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"expected {least:g} to {most:g}, got {text!r}")
+        return value
+
+    return limited_number
+
+
 def whole(least: int, most: int) -> Callable[[str], int]:
     """Return what reads a whole number within limits, for argparse."""
 

@@ -20,9 +20,9 @@ from headvox.commands.flags import (
     Parser,
     UsageError,
     add_settings,
+    between,
     config_of,
     keep_input,
-    number,
     seed_number,
     tracker_config_of,
     whole_number,
@@ -306,10 +306,14 @@ def _parser() -> Parser:
     peers.add_argument("--clouds", type=Path, metavar="DIR", help="peers: folder of the four meshes")
     rules = parser.add_argument_group("what counts")
     rules.add_argument(
-        "--radius", type=length, default=0.15, metavar="M", help="found within this distance (0.15)"
+        "--radius",
+        type=between(0.001, 10.0),
+        default=0.15,
+        metavar="M",
+        help="found within this distance (0.15)",
     )
     rules.add_argument(
-        "--clear", type=length, default=0.0, metavar="M",
+        "--clear", type=between(0.0, 10.0), default=0.0, metavar="M",
         help="a detection that is left over is no false head this near to a true one (0)",
     )  # fmt: skip
     rules.add_argument(
@@ -327,7 +331,11 @@ def _parser() -> Parser:
             f"--{name}", type=whole_number, default=usual, metavar="N", help=f"{text} ({usual})"
         )
     scenes.add_argument(
-        "--revolutions", type=length, default=1.0, metavar="R", help="rotation: how many turns (1)"
+        "--revolutions",
+        type=between(0.01, 100.0),
+        default=1.0,
+        metavar="R",
+        help="rotation: how many turns, up to 100 (1)",
     )
     scenes.add_argument(
         "--seed", type=seed_number, default=0, metavar="N", help="another number, other heads and people (0)"
@@ -345,11 +353,3 @@ def limit(text: str) -> Limit:
         return Limit.parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def length(text: str) -> float:
-    """Read a number that is not below 0, for argparse."""
-    value = number(text)
-    if value < 0.0:
-        raise argparse.ArgumentTypeError(f"expected 0 or more, got {text!r}")
-    return value

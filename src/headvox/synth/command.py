@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from headvox.commands.flags import Parser, seed_number, whole, whole_number
+from headvox.commands.flags import Parser, between, seed_number, whole, whole_number
 from headvox.commands.live import Live
 from headvox.commands.table import printable, table
 from headvox.parallel.workers import add_flags, of_flags
@@ -207,7 +207,7 @@ def _add_recording(parser: argparse.ArgumentParser, sensors: Sequence[str]) -> N
         text += "; any: another one for each camera, from clean to terrible"
     parser.add_argument("--sensor", choices=sensors, default="d435i", help=text)
     parser.add_argument("--frames", type=whole(1, 1_000_000), default=100, metavar="N", help="how many (100)")
-    parser.add_argument("--hz", type=rate, metavar="HZ", help="frames a second (10)")
+    parser.add_argument("--hz", type=between(0.01, 1000.0), metavar="HZ", help="frames a second (10)")
     _add_making(parser)
 
 
@@ -217,11 +217,3 @@ def _add_making(parser: argparse.ArgumentParser, seeded: bool = True) -> None:
             "--seed", type=seed_number, default=0, metavar="N", help="another number, others (0)"
         )
     add_flags(parser)
-
-
-def rate(text: str) -> float:
-    """Read a rate, for argparse."""
-    value = float(text)
-    if not 0.01 <= value <= 1000.0:
-        raise argparse.ArgumentTypeError(f"expected 0.01 to 1000, got {text!r}")
-    return value

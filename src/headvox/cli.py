@@ -56,6 +56,9 @@ MODULES = {
     "bench": ("headvox.bench.command", "measure how fast it is here"),
 }
 
+# Commands with the settings of the detector, which decide how much memory it takes.
+WITH_SETTINGS = {"run", "view", "render", "eval"}
+
 DESCRIPTION = (
     "Find human heads in 3-D, in real time, in point clouds and depth images, without a neural network."
 )
@@ -98,7 +101,7 @@ def _main(arguments: list[str]) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        _complain(*_words(error))
+        _complain(*_words(error, arguments))
         if isinstance(error, Undecided):
             for choice in error.choices:
                 print(printable(f"    {choice}"), file=sys.stderr)
@@ -138,12 +141,14 @@ def _dispatch(arguments: list[str]) -> int:
         return USAGE
 
 
-def _words(error: Exception) -> tuple[str, str]:
+def _words(error: Exception, arguments: Sequence[str]) -> tuple[str, str]:
     """Return what happened and what to do about it."""
     if isinstance(error, HeadvoxError):
         return f"error: {error.what}", error.do
     if isinstance(error, MemoryError):
-        return "error: not enough memory.", "Set a smaller --max-range, or a larger --voxel."
+        has_settings = WITH_SETTINGS.intersection(arguments[:1])
+        do = "Set a smaller --max-range, or a larger --voxel." if has_settings else "Close other programs."
+        return "error: not enough memory.", do
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
         return f"error: {name}{error.strerror or error}.", ""

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from inputs import write_recording
 
 from headvox import cli
+from headvox.commands import run as run_command
 
 
 def test_a_bad_frame_is_told_counted_and_skipped(tmp_path: Path) -> None:
@@ -161,6 +162,22 @@ def test_a_fault_of_headvox_asks_for_a_report(
     assert "headvox: internal error: ZeroDivisionError: by zero" in errors
     assert "please report it" in errors
     assert ("Traceback" in errors) == debug
+
+
+@pytest.mark.parametrize(
+    ("command", "function", "told"),
+    [("run", "_run", "--max-range"), ("warmup", "_warmup", "Close other programs.")],
+)
+def test_flags_that_save_memory_are_named_where_there_are_any(
+    monkeypatch: pytest.MonkeyPatch, command: str, function: str, told: str
+) -> None:
+    def fail(args: object) -> int:
+        raise MemoryError
+
+    monkeypatch.setattr(run_command if command == "run" else cli, function, fail)
+    done = headvox(command)
+    assert_explained(done)
+    assert told in done.stderr
 
 
 def test_a_place_without_a_cache_is_explained(

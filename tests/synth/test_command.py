@@ -123,6 +123,7 @@ def test_a_place_that_cannot_be_written_is_named_as_it_was_given(tmp_path, kind)
         ("heads",),
         ("heads", "--count", 0, "-o", "new"),
         ("heads", "--points", "many", "-o", "new"),
+        ("heads", "--points", 10**11, "-o", "new"),
         ("heads", "--seed", -1, "-o", "new"),
         ("scene", "--people", 7, "-o", "new"),
         ("scene", "--sensor", "sonar", "-o", "new"),

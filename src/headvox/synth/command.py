@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from headvox.synth.scene import Scene
 
 MOST_PEOPLE = 6
+MOST_POINTS = 1_000_000  # to spread them takes 5 KB for each
 SENSORS = ("d435i", "d435i-small", "kinect", "ideal")
 EXAMPLES = """\
 examples:
@@ -157,7 +158,9 @@ def _parser() -> Parser:
         kinds, "heads", _heads, "the paper's data set: bald heads as clouds of evenly spread points"
     )
     heads.add_argument("--count", type=whole_number, default=44, metavar="N", help="how many people (44)")
-    heads.add_argument("--points", type=whole_number, default=9000, metavar="N", help="of each cloud (9000)")
+    heads.add_argument(
+        "--points", type=whole(1, MOST_POINTS), default=9000, metavar="N", help="of each cloud (9000)"
+    )
     heads.add_argument(
         "--metric", action="store_true", help="keep real sizes; else all have 64 mm between the eyes"
     )

@@ -3,7 +3,7 @@ from dataclasses import fields, replace
 
 import pytest
 
-from headvox.config import DetectorConfig, load_config, to_toml
+from headvox.config import DetectorConfig, TrackerConfig, load_config, to_toml
 from headvox.errors import HeadvoxError
 from headvox.pipeline import Detector
 from headvox.tracking.tracker import Tracker
@@ -58,11 +58,13 @@ def test_a_file_beats_the_defaults_and_leaves_the_rest(tmp_path):
         ("[detector]\nthreads = 65", "threads: expected 1 to 64, got 65"),
         ("[detector]\ncascade = 1", "cascade: expected text, got 1"),
         ('[detector]\nrefine = "ball"', "refine: expected .*, got 'ball'"),
-        ('[detector]\nmax_range_m = "5"', "max_range_m: expected a number, got '5'"),
+        ('[detector]\nmax_range_m = "5"', "max_range_m: expected a number from -1e9 to 1e9, got '5'"),
         ("[detector]\nmax_range_m = 0", "max_range_m: expected more than 0"),
         ("[detector]\nmax_range_m = 51", "max_range_m: expected more than 0 and at most 50 m, got 51"),
         ("[detector]\nmax_range_m = nan", "max_range_m"),
-        ("[detector]\nmax_range_m = inf", "max_range_m"),
+        ("[detector]\nmax_range_m = inf", "max_range_m: expected a number from -1e9 to 1e9, got inf"),
+        ("[detector]\nmin_score = 1e30", r"min_score: expected a number from -1e9 to 1e9, got 1e\+30"),
+        ("[detector]\nthreads = 1" + "0" * 30, "threads: expected 1 to 64, got 10"),
         ("[detector]\nmin_height_m = 3.0", "max_height_m: expected above min_height_m"),
         ("[detector]\nmin_height_m = -inf", "min_height_m|max_height_m"),
         ("[detector]\nmin_height_m = nan", "min_height_m|max_height_m"),
@@ -109,6 +111,13 @@ def test_a_missing_file(tmp_path):
 def test_a_bad_setting_made_in_python(setting, told):
     with pytest.raises(HeadvoxError, match=told):
         DetectorConfig(**setting)
+
+
+def test_a_setting_of_the_tracker_that_is_too_large_is_told_how_large_it_may_be():
+    with pytest.raises(
+        HeadvoxError, match=r"gate_sigmas: expected a number above 0, 1e9 at most, got 1e\+30"
+    ):
+        TrackerConfig(gate_sigmas=1e30)
 
 
 @pytest.mark.parametrize("make", [Detector, Tracker])

@@ -112,14 +112,10 @@ class TrackerConfig:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name in ("confirm_hits", "confirm_frames"):
-                _require(
-                    isinstance(value, Integral) and _is_number(value, 1e9),
-                    field.name,
-                    "a whole number",
-                    value,
-                )
+                _require(_is_whole(value), field.name, "a whole number", value)
             else:
-                _require(_is_number(value, 1e9) and value > 0, field.name, "a number above 0", value)
+                good = _is_number(value, 1e9) and value > 0
+                _require(good, field.name, "a number above 0, 1e9 at most", value)
         hits, frames = self.confirm_hits, self.confirm_frames
         _require(1 <= hits <= 60, "confirm_hits", "1 to 60", hits)
         _require(hits <= frames <= 60, "confirm_frames", f"confirm_hits ({hits}) to 60", frames)
@@ -213,9 +209,13 @@ def _check_type(key: str, value: object) -> None:
     elif key in ("cascade", "refine", "backend"):
         _require(isinstance(value, str), key, "text", value)
     elif key == "threads":
-        _require(isinstance(value, Integral) and _is_number(value, 1e9), key, "a whole number", value)
+        _require(_is_whole(value), key, "a whole number", value)
     elif value is not None or key not in ("min_score", "voxel_m"):
-        _require(_is_number(value, 1e9), key, "a number", value)
+        _require(_is_number(value, 1e9), key, "a number from -1e9 to 1e9", value)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def _is_number(value: object, most: float) -> bool:

@@ -312,7 +312,10 @@ def _object(value: Any, name: str) -> dict[str, Any]:
 
 def _integer(value: Any, name: str) -> int:
     if type(value) is not int or not -(2**63) <= value < 2**63:
-        raise HeadvoxError(f"{name}: expected a whole number, got {_short(value)}.", "Correct the JSON.")
+        size = " of 64 bits" if type(value) is int else ""
+        raise HeadvoxError(
+            f"{name}: expected a whole number{size}, got {_short(value)}.", "Correct the JSON."
+        )
     return value
 
 

@@ -414,6 +414,30 @@ def test_an_mcap_that_was_not_closed_says_so(tmp_path):
         opened(place)
 
 
+def test_a_bag_of_nothing_but_its_first_bytes_ends_too_early(tmp_path):
+    (tmp_path / "magic.mcap").write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(
+        HeadvoxError, match=r"magic\.mcap: the bag is damaged: it ends too early\. .* mcap recover"
+    ):
+        opened(tmp_path / "magic.mcap")
+
+
+def test_a_bag_is_read_once(tmp_path):
+    source, _ = opened(write_bag(tmp_path, "bare-mcap", rig(Maker())))
+    assert len(list(source)) == 3
+    with pytest.raises(HeadvoxError, match=r"is read once, and is closed then\. Open it again\."):
+        next(iter(source))
+
+
+def test_a_bag_that_is_closed_meanwhile_just_ends(tmp_path):
+    source, _ = opened(write_bag(tmp_path, "bare-mcap-flat", rig(Maker(), 9)))
+    frames = []
+    for frame in source:
+        frames.append(frame)
+        source.close()
+    assert [type(frame) for frame in frames] == [Frame]
+
+
 def test_the_package_to_install_is_named(tmp_path, monkeypatch):
     place = write_bag(tmp_path, "bare-mcap", rig(Maker()))
     monkeypatch.setattr(bagfile, "_loaded", [])

@@ -145,7 +145,8 @@ def _damaged(name: str, kind: str, error: Exception) -> HeadvoxError:
     """Say what is wrong with a bag as a whole."""
     if isinstance(error, HeadvoxError):
         return error
-    reason = _one_line(error)
+    # Its readers take a byte where there is none, at the end of a file, for one: ord() of nothing is a TypeError.
+    reason = "it ends too early" if isinstance(error, TypeError) else _one_line(error)
     if "end magic" in reason or "footer" in reason:
         return HeadvoxError(
             f"{name}: the MCAP file has no end: it was not closed when it was recorded, or not copied whole.",

@@ -97,7 +97,13 @@ class BagSource:
         return {s.topic: stamp_ns(self.bag.first(s.topic).header.stamp) for s in self.sensors}
 
     def __iter__(self) -> Iterator[Frame | BadFrame]:
-        """Yield the frames in time order, until closed; at the end the file is closed."""
+        """Yield the frames in time order, until closed; at the end the file is closed.
+
+        Raises:
+            HeadvoxError: it is closed already.
+        """
+        if not self._open:
+            raise HeadvoxError(f"{self.name}: a bag is read once, and is closed then.", "Open it again.")
         synchroniser = Synchroniser(
             TOLERANCE_NS, _WAIT_S, _TIMEOUT_S, frozenset(self._by_topic), most_open=_MOST_WAITING
         )
@@ -131,7 +137,8 @@ class BagSource:
                     return
                 yield message
         except HeadvoxError as error:
-            self._damage = error
+            if self._open:  # else it is only closed
+                self._damage = error
 
     def close(self) -> None:
         """End the iteration and close the file."""

@@ -122,6 +122,8 @@ def place(text: str) -> Path | str:
     """Return a path, or the address of what lies elsewhere as it is, for argparse."""
     from headvox.sources.remote import is_remote
 
+    if not text:  # a variable of a shell that is not set: the path would be that of the current folder
+        raise argparse.ArgumentTypeError("expected a path or an address, got ''")
     return text if is_remote(text) else Path(text)
 
 

@@ -13,6 +13,22 @@ from inputs import write_recording
 
 from headvox import __version__, cli
 
+COMMANDS = [
+    "run",
+    "info",
+    "convert",
+    "config",
+    "warmup",
+    "view",
+    "render",
+    "masks",
+    "doctor",
+    "completion",
+    "synth",
+    "eval",
+    "align",
+    "bench",
+]
 HEAVY = ("numba", "numpy", "scipy", "PIL", "matplotlib")
 
 
@@ -86,6 +102,12 @@ def test_masks_are_listed_and_shown(anything: Path) -> None:
     assert "Stage 1, the gate: 1 conditions, at most 8 look-ups a voxel" in shown
     assert "Stage 2, boosted: 1 trees in 1 stages" in shown
     assert "radius 0.1, height +0, 0.1x0.1x0.1" in shown
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_says_what_it_does(command: str) -> None:
+    shown = headvox(command, "--help").stdout
+    assert shown.split("\n\n")[1].endswith(".")
 
 
 def test_warmup_leaves_nothing_to_compile() -> None:

@@ -29,6 +29,11 @@ def test_a_folder_of_another_seed_is_not_mixed(tmp_path):
         search.evolve(search.Settings(tmp_path, 200, seed=5), print)
 
 
+def test_too_few_views_are_told(tmp_path):
+    with pytest.raises(HeadvoxError, match="Expected at least 200 views"):
+        search.evolve(search.Settings(tmp_path, 199), print)
+
+
 @pytest.mark.parametrize("library", ["lightgbm", "cmaes"])
 def test_what_is_missing_is_named_before_any_view_is_made(tmp_path, monkeypatch, capsys, library):
     monkeypatch.chdir(tmp_path)
@@ -40,8 +45,8 @@ def test_what_is_missing_is_named_before_any_view_is_made(tmp_path, monkeypatch,
 
 def test_bad_commands_end_before_any_work(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["masks", "evolve", "--views", "20"]) == 1
-    assert "--views: expected at least 200" in capsys.readouterr().err
+    assert main(["masks", "evolve", "--views", "20"]) == 2
+    assert "--views: expected at least 200, got '20'" in capsys.readouterr().err
     (tmp_path / "evolved.toml").write_text("mine")
     assert main(["masks", "evolve"]) == 1
     assert "exists already" in capsys.readouterr().err

@@ -95,9 +95,14 @@ def keep_input(output: Path, inputs: Sequence[str | Path | None]) -> None:
             )
 
 
+def sentence(text: str) -> str:
+    """Return what the list of commands says of one, as a sentence."""
+    return text[0].upper() + text[1:] + "."
+
+
 def add_command(commands: Commands, name: str, function: Command, text: str) -> Parser:
     """Add a command that is done by ``function``, and return its parser."""
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    parser = commands.add_parser(name, help=text, description=sentence(text))
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     parser.set_defaults(command=function, parser=parser)
     return parser

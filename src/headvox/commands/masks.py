@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from headvox.commands.flags import GOOD, add_command, seed_number, whole_number
+from headvox.commands.flags import GOOD, UsageError, add_command, seed_number, sentence, whole_number
 from headvox.commands.table import file_name, printable, table
 from headvox.errors import HeadvoxError
 from headvox.parallel.workers import add_flags, of_flags
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 def add_to(commands: Commands) -> None:
     """Add ``headvox masks`` to the command line."""
-    masks = commands.add_parser("masks", help="list, show and plot cascades of masks")
+    text = "list, show, plot and search for cascades of masks"
+    masks = commands.add_parser("masks", help=text, description=sentence(text))
     actions = masks.add_subparsers(title="commands", metavar="COMMAND", required=True)
     add_command(actions, "list", _masks_list, "list the cascades that ship with headvox")
     cascade = "name of a shipped cascade, or a cascade file"
@@ -83,10 +84,12 @@ def _masks_plot(args: argparse.Namespace) -> int:
 
 
 def _masks_evolve(args: argparse.Namespace) -> int:
-    from headvox.evolve.search import Settings, evolve
+    from headvox.evolve.search import LEAST_VIEWS, Settings, evolve
     from headvox.evolve.write import write_cascade
     from headvox.writable import check_file
 
+    if args.views < LEAST_VIEWS:
+        raise UsageError(f"argument --views: expected at least {LEAST_VIEWS}, got '{args.views}'")
     out = args.output or Path(f"{args.name}.toml")
     if out.exists():
         raise HeadvoxError(f"{out}: exists already.", "Give another file with -o, or move it away.")

@@ -42,6 +42,7 @@ from headvox.masks.read import load_cascade, parse_cascade
 from headvox.parallel.workers import ALONE, Workers
 from headvox.writable import make_folder
 
+LEAST_VIEWS = 200
 GATE_VIEWS = 3000
 GATE_LOSES, TIGHT_GATE_LOSES = 0.03, 0.004
 SEARCH_ROUNDS = 2
@@ -183,8 +184,8 @@ def _need_libraries() -> None:
 
 def _claim(settings: Settings) -> None:
     """Make the folder, or see that its views are of the same seed."""
-    if settings.views < 200:
-        what = f"--views: expected at least 200, of which 20 are kept aside, got {settings.views}."
+    if settings.views < LEAST_VIEWS:
+        what = f"Expected at least {LEAST_VIEWS} views, of which 20 are kept aside, got {settings.views}."
         raise HeadvoxError(what, "Thousands are better.")
     make_folder(settings.work / "views", settings.work)
     note = settings.work / "search.json"

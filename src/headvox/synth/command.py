@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from headvox.commands.flags import Parser, between, seed_number, whole, whole_number
+from headvox.commands.flags import Parser, between, seed_number, sentence, whole, whole_number
 from headvox.commands.live import Live
 from headvox.commands.table import printable, table
 from headvox.parallel.workers import add_flags, of_flags
@@ -193,7 +193,7 @@ def _kind(
     function: Callable[[argparse.Namespace], None],
     text: str,
 ) -> Parser:
-    parser = kinds.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    parser = kinds.add_parser(name, help=text, description=sentence(text))
     parser.add_argument("-o", dest="out", type=Path, required=True, metavar="DIR", help="a new folder")
     parser.set_defaults(command=function, parser=parser)
     return parser

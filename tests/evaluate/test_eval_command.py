@@ -281,6 +281,7 @@ def test_wrong_usage(clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         assert main(["eval", "rotation", "--revolutions", revolutions]) == 2
     assert main(["eval", str(clouds), "--max-range", "-1"]) == 2
     assert main(["eval", "static", "--seed", "-1"]) == 2
+    assert main(["eval", str(clouds), "--name", "mine"]) == 2
     capsys.readouterr()
     assert main(["eval", "two-cameras", "--scheduler", "local"]) == 2
     assert "two-cameras is made by --workers N of this machine" in capsys.readouterr().err

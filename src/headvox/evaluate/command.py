@@ -209,6 +209,8 @@ def _scenarios(args: argparse.Namespace, live: Live) -> list[Scenario]:
         made = [
             keep(made[0], args.keep, lambda k: live.show(f"{made[0].name}: frame {k} of {made[0].length}"))
         ]
+    if args.name is not None and args.heads is None:
+        raise UsageError("--name goes with --heads: it is what to call the detector of that file")
     if args.heads is not None and (len(made) != 1 or not (made[0].recording or made[0].rules)):
         raise UsageError("--heads goes with exactly one recording, or with peers")
     return made

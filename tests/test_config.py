@@ -86,6 +86,10 @@ def test_a_bad_file_is_an_error_that_names_the_setting(tmp_path, text, told):
     assert error.value.do
 
 
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
+    assert load(tmp_path, b"\xef\xbb\xbf[detector]\nthreads = 2").threads == 2
+
+
 def test_a_missing_file(tmp_path):
     with pytest.raises(HeadvoxError, match=r"Configuration .*none\.toml: No such file"):
         load_config(tmp_path / "none.toml")

@@ -1,5 +1,6 @@
 import copy
 from dataclasses import replace
+from importlib import resources
 
 import naive_voxels
 import numpy as np
@@ -265,6 +266,12 @@ def test_an_error_names_the_cascade_and_the_entry(table, path, new, told):
     assert told in error.value.what
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 400
+
+
+def test_a_byte_order_mark_is_no_part_of_a_cascade(tmp_path):
+    text = (resources.files("headvox") / "cascades" / "paper.toml").read_text("utf-8")
+    (tmp_path / "mine.toml").write_text(text, "utf-8-sig")
+    assert load_cascade(tmp_path / "mine.toml").name == load_cascade("paper").name
 
 
 def test_no_such_cascade():

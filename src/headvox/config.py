@@ -169,7 +169,8 @@ def load_tracker_config(path: str | Path) -> TrackerConfig:
 
 def _load(path: str | Path, kind: type[Config]) -> Config:
     try:
-        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        # Editors of Windows may begin it with a BOM.
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise HeadvoxError(f"Configuration {path}: {error.strerror or error}.", "Check the path.") from None
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, too many digits, nested too deep

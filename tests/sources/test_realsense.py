@@ -10,6 +10,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from headvox.calibrate.command import extrinsics_text
 from headvox.data import Frame, Intrinsics
 from headvox.errors import HeadvoxError, Undecided
 from headvox.sources import open_source, realsense
@@ -265,6 +266,12 @@ def test_extrinsics_that_cannot_be_used_are_refused(tmp_path, text, message):
     with pytest.raises(HeadvoxError, match=message) as refused:
         read_extrinsics(str(tmp_path / "rig"))
     assert "\n" not in str(refused.value)
+
+
+def test_a_byte_order_mark_is_no_part_of_extrinsics(tmp_path):
+    text = extrinsics_text({"1": np.eye(4)})
+    (tmp_path / "rig").write_text(text, "utf-8-sig")
+    assert list(read_extrinsics(str(tmp_path / "rig"))) == ["1"]
 
 
 def test_extrinsics_that_are_not_there_are_refused(tmp_path):

@@ -98,7 +98,7 @@ def read_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise HeadvoxError(f"{path}: more than {_MAX_BYTES >> 20} MB.", "Cut the recording in pieces.")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows may begin it with a BOM
     except OSError as error:
         raise HeadvoxError(f"{path}: {error.strerror or error}.", "Check the path.") from None
     except UnicodeDecodeError:

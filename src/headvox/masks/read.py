@@ -74,7 +74,7 @@ def load_cascade(name_or_path: str | Path) -> Cascade:
             f"Cascade {name}: larger than {MAX_FILE_BYTES >> 20} MiB.", "That is no cascade file."
         )
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")  # editors of Windows may begin it with a BOM
     except (OSError, UnicodeDecodeError) as error:
         raise HeadvoxError(f"Cascade {name} cannot be read: {error}.", "Expected a TOML text file.") from None
     return parse_cascade(text, name)

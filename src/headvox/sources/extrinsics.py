@@ -34,7 +34,7 @@ def read_extrinsics(file: str) -> dict[str, F64]:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise HeadvoxError(f"{file}: expected at most {_MOST_BYTES} bytes.", _HELP)
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows may begin it with a BOM
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise HeadvoxError(f"{file}: cannot be read: {reason}.", "Check the path.") from None

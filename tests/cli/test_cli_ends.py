@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,17 @@ def test_what_is_interrupted_ends_with_whole_lines(tmp_path: Path, number: int, 
     assert written.endswith("\n")
     assert written.startswith(first + rest)
     assert all(parse(line) for line in written.splitlines())
+
+
+def test_ctrl_c_while_the_command_is_imported_ends_quietly(tmp_path: Path) -> None:
+    (tmp_path / "argparse.py").write_text("raise KeyboardInterrupt")
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from headvox.__main__ import main; sys.exit(main())"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
 
 
 def test_a_closed_pipe_ends_quietly(recording: Path) -> None:

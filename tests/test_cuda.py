@@ -56,7 +56,7 @@ def test_the_same_heads_on_a_gpu_or_in_the_simulator():
 
 
 @pytest.mark.skipif(
-    not INSTALLED or importlib.util.find_spec("nvidia") is None, reason="needs headvox[cuda]: libNVVM"
+    not INSTALLED or importlib.util.find_spec("nvidia") is None, reason="needs headvox[against]: libNVVM"
 )
 def test_every_kernel_compiles_for_a_gpu():
     run_pytest("ptx_of_kernels.py")

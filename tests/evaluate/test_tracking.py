@@ -177,7 +177,7 @@ def test_hota_is_what_the_paper_says(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_hota_is_that_of_its_authors(seed: int) -> None:
     metrics = pytest.importorskip(
-        "trackeval.metrics", reason="trackeval, which pulls OpenCV in, is not installed", exc_type=ImportError
+        "trackeval.metrics", reason="needs headvox[against]: trackeval", exc_type=ImportError
     )
     frames = random_tracks(seed)
     true = np.unique(np.concatenate([f.true_ids for f in frames]))

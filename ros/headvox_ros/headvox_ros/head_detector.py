@@ -74,7 +74,7 @@ class HeadDetector(SensorNode):
         config = config_from(DetectorConfig, "detector", values)
         warm_up(config)
         self._detector = Detector(config)
-        self._tracker = Tracker(config_from(TrackerConfig, "track", values)) if values["tracking"] else None
+        self._tracker = Tracker() if values["tracking"] else None
         self._board = outputs.MarkerBoard(self.get_parameter("marker_lifetime_s").value)
 
     def process(self, frame: Frame) -> None:
@@ -112,9 +112,7 @@ class HeadDetector(SensorNode):
             self._detector.close()
             self._detector = Detector(config)
         if self._tracker is not None:
-            settings = config_from(TrackerConfig, "track", values)
-            if settings != self._tracker.config:
-                self._tracker.config = settings
+            self._tracker.config = config_from(TrackerConfig, "track", values)
 
     def release(self) -> None:
         """End the detector's threads."""

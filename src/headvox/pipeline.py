@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -92,6 +93,7 @@ class Detector:
         self._alone = Turns(("This Detector is at work in another thread.", "Give each thread its own."))
         self._threads = Threads(self.config.threads)
         self._placing = Placing(self.config)
+        self._most_sensors = 0
         self._memory: Memory | None = None
         if (
             not self.on_device
@@ -138,9 +140,12 @@ class Detector:
         """
         with self._alone:
             if self.on_device:
-                return self._detect_together([frame], [expected])[0]
-            with self._threads.awake():
-                return self._detect(frame, expected)
+                heads = self._detect_together([frame], [expected])[0]
+            else:
+                with self._threads.awake():
+                    heads = self._detect(frame, expected)
+            self._tell_of_unsearched(frame)
+            return heads
 
     def detect_batch(self, frames: Iterable[Frame]) -> list[Heads]:
         """Return the heads in each of ``frames``, as :meth:`detect_frame` does; on a GPU, several go at once.
@@ -152,6 +157,8 @@ class Detector:
         with self._alone:
             while part := list(islice(left, BATCH)):
                 found += self._detect_together(part, [None] * len(part))
+                for frame in part:
+                    self._tell_of_unsearched(frame)
         return found
 
     def candidates_of_last_frame(self) -> tuple[F64, F64]:
@@ -175,6 +182,17 @@ class Detector:
         """End the detector's threads; what is asked of it later runs in the thread that asks."""
         with self._alone:
             self._threads.close()
+
+    def _tell_of_unsearched(self, frame: Frame) -> None:
+        """Tell once of a sensor before which nobody looks. Only a frame of more sensors than any before is asked."""
+        sensors = len(frame.depths) + len(frame.clouds)
+        if sensors <= self._most_sensors:
+            return
+        self._most_sensors = sensors
+        told = self._placing.unsearched(frame)
+        if told is not None:
+            self._most_sensors = sys.maxsize
+            self._note(told)
 
     def _detect_together(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
         """Return the heads in up to :data:`BATCH` frames: at once on a GPU; without, or when it fails, one by one."""

@@ -8,11 +8,14 @@ import numpy as np
 
 from headvox.check import origins_of
 from headvox.config import DetectorConfig
-from headvox.data import F32, Cloud, DepthImage, Frame, Intrinsics
+from headvox.data import F32, F64, Cloud, DepthImage, Frame, Intrinsics
 from headvox.fuse import Region
 from headvox.masks.compile import CompiledCascade
 from headvox.visibility import camera_table
 from headvox.voxelize import Lattice, Rays, part_transform
+
+AHEAD_M, AHEAD_SHARE = 2.0, 0.4
+"""How far before a sensor heads are plainly expected, metres; in a small region, as a share of its radius."""
 
 
 class View(NamedTuple):
@@ -38,18 +41,37 @@ class Placing:
         Raises:
             HeadvoxError: more voxels than a grid can number.
         """
-        region = self._region(frame)
+        region = self.region(frame)
         if self._lattice is None or self._lattice.region != region:
             self._lattice = Lattice.over(region, cascade.voxel_m, cascade.source.subdivision)
         return self._lattice
 
-    def _region(self, frame: Frame) -> Region:
+    def region(self, frame: Frame) -> Region:
+        """Return where ``frame`` is searched."""
         config, centre = self.config, self.config.centre
         if centre is None:
             origins = origins_of(frame)
             x, y, z = origins.mean(axis=0).tolist() if len(origins) else (0.0, 0.0, 0.0)
             centre = (x, y, z)
         return Region(centre, config.max_range_m, config.min_height_m, config.max_height_m)
+
+    def unsearched(self, frame: Frame) -> str | None:
+        """Return a line about the first sensor before which nobody looks; None if all is well, or the centre is set."""
+        if self.config.centre is not None:
+            return None
+        region = self.region(frame)
+        ahead = min(AHEAD_M, AHEAD_SHARE * region.radius_m)
+        for image in frame.depths:
+            away = image.T_world_camera[:3, 3] - region.centre
+            if _length(away + ahead * image.T_world_camera[:3, 2]) > region.radius_m:
+                return _unsearched(image.name, _length(away), f"{ahead:g} m ahead of it", region)
+        for cloud in frame.clouds:
+            if cloud.T_world_sensor is None:
+                continue
+            far = _length(cloud.T_world_sensor[:3, 3] - region.centre)  # where it looks is not known
+            if far + ahead > region.radius_m:
+                return _unsearched(cloud.name, far, f"{ahead:g} m behind it, as seen from there", region)
+        return None
 
     def view(self, image: DepthImage, lattice: Lattice) -> View:
         """Return where the camera of ``image`` sees the cells of ``lattice``."""
@@ -72,3 +94,14 @@ class Placing:
     def rays(self, image: DepthImage, lattice: Lattice) -> Rays:
         """Return the rays of the pixels of ``image`` in ``lattice``."""
         return self.view(image, lattice).rays
+
+
+def _length(offset: F64) -> float:
+    return float(np.sqrt((offset**2).sum()))
+
+
+def _unsearched(name: str, far_m: float, where: str, region: Region) -> str:
+    return (
+        f"{name} stands {far_m:.1f} m from the mean of the sensors, and no head is sought farther than "
+        f"{region.radius_m:g} m from that: not even {where}; set centre or max_range_m (--centre, --max-range)"
+    )

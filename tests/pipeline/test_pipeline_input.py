@@ -1,6 +1,7 @@
 """What a detector takes, and what it refuses."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from headvox import Cloud, DepthImage, Detector, Frame, Heads, HeadvoxError, Int
 from headvox.config import DetectorConfig
 from headvox.data import BadFrame
 from headvox.masks.read import parse_cascade
+from headvox.placing import Placing
 
 
 def test_one_point_is_no_head(make):
@@ -274,3 +276,49 @@ def test_data_classes_iterate_and_compare():
 def test_a_cascade_of_the_tests_is_a_cascade():
     assert parse_cascade(scenes.STAGES, "x").sees
     assert not parse_cascade(scenes.VOTES, "x").sees
+
+
+def back_to_back(apart_m):
+    """Two cameras so far apart that look away from each other, each at a wall 1 m before it."""
+    depth, images = np.full((6, 8), 1000, np.uint16), []
+    for name, sign in (("left", -1.0), ("right", 1.0)):
+        T = np.eye(4)
+        T[:3, :3] = np.array([[0, 0, sign], [-sign, 0, 0], [0, -1, 0]])
+        T[:3, 3] = sign * apart_m / 2, 0.0, 1.5
+        images.append(DepthImage(name, depth, Intrinsics(8, 6, 8.0, 8.0, 3.5, 2.5, 0.001), T))
+    return images
+
+
+def test_a_sensor_before_which_nobody_looks_is_told_once(cascades):
+    config = DetectorConfig(cascade=cascades["stages"])
+    told: list[str] = []
+    with closing(Detector(config, note=told.append)) as detector:
+        detector.detect_depth(back_to_back(7.0)[:1])  # the other one comes later
+        detector.detect_depth(back_to_back(5.0))
+        assert told == []
+        images = back_to_back(7.0)
+        detector.detect_depth([*images, replace(images[0], name="third")])
+        detector.detect_depth(images)
+    (line,) = told
+    assert line.startswith(
+        "right stands 4.7 m from the mean of the sensors, and no head is sought farther than 5 m"
+    )
+    assert "not even 2 m ahead of it; set centre or max_range_m (--centre, --max-range)" in line
+
+
+def test_whether_nobody_looks_before_a_sensor():
+    def told(frame, **settings):
+        return Placing(DetectorConfig(**settings)).unsearched(frame)
+
+    away = back_to_back(8.0)
+    assert "left stands 4.0 m" in told(Frame(0, depths=tuple(away)))
+    assert told(Frame(0, depths=tuple(away)), centre=(0.0, 0.0, 1.5)) is None  # somebody chose it
+    assert told(Frame(0, depths=tuple(away)), max_range_m=7.0) is None
+    turn = np.diag([-1.0, 1.0, -1.0, 1.0])
+    inward = tuple(replace(image, T_world_camera=image.T_world_camera @ turn) for image in away)
+    assert told(Frame(0, depths=inward)) is None
+    assert told(Frame(0, depths=tuple(away[:1])), max_range_m=0.5) is None
+    points = np.ones((5, 3), np.float32)
+    clouds = tuple(Cloud(image.name, points, image.T_world_camera) for image in away)
+    assert "left stands 4.0 m" in told(Frame(0, clouds=clouds))
+    assert told(Frame(0, clouds=(Cloud("placed", points),))) is None

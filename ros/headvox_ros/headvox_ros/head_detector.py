@@ -73,7 +73,7 @@ class HeadDetector(SensorNode):
         values = self.values
         config = config_from(DetectorConfig, "detector", values)
         warm_up(config)
-        self._detector = Detector(config)
+        self._detector = self._new_detector(config)
         self._tracker = Tracker() if values["tracking"] else None
         self._board = outputs.MarkerBoard(self.get_parameter("marker_lifetime_s").value)
 
@@ -110,9 +110,12 @@ class HeadDetector(SensorNode):
         config = config_from(DetectorConfig, "detector", values)
         if config != self._detector.config:
             self._detector.close()
-            self._detector = Detector(config)
+            self._detector = self._new_detector(config)
         if self._tracker is not None:
             self._tracker.config = config_from(TrackerConfig, "track", values)
+
+    def _new_detector(self, config: DetectorConfig) -> Detector:
+        return Detector(config, note=lambda text: self.get_logger().warning(text))
 
     def release(self) -> None:
         """End the detector's threads."""

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from headvox.calibrate.command import extrinsics_text, spread_frames
+from headvox.calibrate.command import _views, extrinsics_text, spread_frames
 from headvox.calibrate.floor import camera_points, find_floor, level, stated, wrong_floor
 from headvox.calibrate.rig import place
 from headvox.commands.convert import convert
@@ -23,6 +23,7 @@ from headvox.errors import HeadvoxError
 from headvox.frames import inverse, transform
 from headvox.sample import sample_folder
 from headvox.sources import open_source
+from headvox.sources.describe import describe
 from headvox.sources.extrinsics import read_extrinsics
 from headvox.sources.recording import RecordingSource
 
@@ -180,6 +181,44 @@ def _options(file: Path):
     from headvox.sources.options import SourceOptions
 
     return SourceOptions(extrinsics=str(file))
+
+
+def with_poses(folder: Path, step_m: float) -> Path:
+    """Write the sample with a left camera that goes ``step_m`` to the left and right, in turn."""
+    shutil.copytree(SAMPLE, folder)
+    described = json.loads((folder / "recording.json").read_text())
+    for k, frame in enumerate(described["frames"]):
+        T = np.array(described["cameras"]["left"]["T_world_camera"])
+        T[1, 3] += step_m * (k % 2)
+        frame["T_world_camera"] = {"left": T.tolist()}
+    (folder / "recording.json").write_text(json.dumps(described))
+    return folder
+
+
+def test_a_moving_camera_cannot_be_aligned(tmp_path):
+    moving = with_poses(tmp_path / "moving", 0.05)
+    with pytest.raises(
+        HeadvoxError, match="left: the camera moves, and extrinsics are for cameras that stand"
+    ):
+        _views(list(open_source(moving))[:4])
+    (left, right) = _views(list(open_source(with_poses(tmp_path / "jitter", 0.001)))[:4])
+    assert (left.name, right.name) == ("left", "right")
+
+
+def test_extrinsics_that_hold_a_moving_camera_still_are_told(tmp_path):
+    moving = with_poses(tmp_path / "moving", 0.05)
+    (tmp_path / "both.toml").write_text(extrinsics_text({"left": np.eye(4), "right": np.eye(4)}))
+    (tmp_path / "right.toml").write_text(extrinsics_text({"right": np.eye(4)}))
+    told: list[str] = []
+    open_source(moving, _options(tmp_path / "right.toml"), told.append)
+    open_source(SAMPLE, _options(tmp_path / "both.toml"), told.append)
+    assert told == []
+    open_source(moving, _options(tmp_path / "both.toml"), told.append)
+    assert len(told) == 1
+    assert "moving: --extrinsics holds cameras still that move in the recording: left;" in told[0]
+    assert "moving" in dict(describe(moving))["camera left"]
+    assert "moving" not in dict(describe(moving))["camera right"]
+    assert "moving" not in dict(describe(with_poses(tmp_path / "jitter", 0.001)))["camera left"]
 
 
 def test_bad_input_is_told_in_a_line(tmp_path):

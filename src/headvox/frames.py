@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import lru_cache
 
 import numpy as np
@@ -12,6 +13,8 @@ from headvox.data import F64, U16, Intrinsics
 from headvox.errors import HeadvoxError
 
 RIGID_TOLERANCE = 1e-3  # extrinsics typed by hand have four digits
+STILL_M = 0.01  # what stands still may jitter so far,
+STILL = 0.01  # and each entry of its rotation by so much: about half a degree
 OPTICAL: F64 = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -43,6 +46,13 @@ def as_rigid(matrix: npt.ArrayLike, name: str) -> F64:
         what, hint = fault
         raise HeadvoxError(f"{name}: {what}", hint)
     return T
+
+
+def is_moving(places: Iterable[F64]) -> bool:
+    """Return whether a sensor with these ``places`` (4, 4), one a frame, moves by more than poses jitter."""
+    T = np.array(list(places), np.float64).reshape(-1, 4, 4)
+    off = np.abs(T - T[:1])
+    return bool((off[:, :3, 3] > STILL_M).any() or (off[:, :3, :3] > STILL).any())
 
 
 @lru_cache(maxsize=64)

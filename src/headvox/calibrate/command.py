@@ -122,6 +122,7 @@ def _about_length(source: Source) -> int:
 
 def _views(frames: list[Frame]) -> list[View]:
     from headvox.calibrate.floor import floor_of
+    from headvox.frames import is_moving
 
     names = list(dict.fromkeys(image.name for frame in frames for image in frame.depths))
     views = []
@@ -130,8 +131,12 @@ def _views(frames: list[Frame]) -> list[View]:
             next((image for image in frame.depths if image.name == name), None) for frame in frames
         )
         seen = [image for image in images if image is not None]
-        still = [image for image in seen if np.array_equal(image.T_world_camera, seen[0].T_world_camera)]
-        some = still[:: max(1, len(still) // FLOOR_FRAMES)][:FLOOR_FRAMES]
+        if is_moving(image.T_world_camera for image in seen):
+            raise HeadvoxError(
+                f"{name}: the camera moves, and extrinsics are for cameras that stand still.",
+                "Align a recording in which it stands still.",
+            )
+        some = seen[:: max(1, len(seen) // FLOOR_FRAMES)][:FLOOR_FRAMES]
         best = floor_of(some)
         if best is None:
             raise HeadvoxError(

@@ -53,7 +53,7 @@ def open_source(
     Args:
         path: of a file or a folder, or ``realsense:``.
         options: what a bag or a camera does not tell by itself; a depth recording takes ``extrinsics``, others none.
-        say: told what is assumed about a bag, a line each; by default these are warnings.
+        say: told what is assumed about a bag, or overruled in a recording, a line each; by default these are warnings.
 
     Returns:
         A source: it yields each :class:`~headvox.data.Frame` once, in time order, and a
@@ -81,7 +81,7 @@ def open_source(
         if not is_recording and is_bag(place):
             return _open_bag(place, options or SourceOptions(), say or _warn)
         if is_recording:
-            return _open_recording(place if place.is_dir() else place.parent, options)
+            return _open_recording(place if place.is_dir() else place.parent, options, say or _warn)
         check_unused(options, place.name)
         if place.is_dir():
             return FolderSource(place)
@@ -92,7 +92,7 @@ def open_source(
     return CloudFileSource(place)
 
 
-def _open_recording(folder: Path, options: SourceOptions | None) -> Source:
+def _open_recording(folder: Path, options: SourceOptions | None, say: Callable[[str], None]) -> Source:
     from headvox.sources.extrinsics import read_extrinsics
     from headvox.sources.options import check_unused
     from headvox.sources.recording import RecordingSource
@@ -101,7 +101,15 @@ def _open_recording(folder: Path, options: SourceOptions | None) -> Source:
         check_unused(options, folder.name)
         return RecordingSource(folder)
     check_unused(replace(options, extrinsics=None), folder.name)
-    return RecordingSource(folder, read_extrinsics(options.extrinsics))
+    placed = read_extrinsics(options.extrinsics)
+    source = RecordingSource(folder, placed)
+    frozen = [camera for camera in source.moving() if camera in placed]
+    if frozen:
+        say(
+            f"{folder.name}: --extrinsics holds cameras still that move in the recording: {', '.join(frozen)}; "
+            "its poses of them are not used"
+        )
+    return source
 
 
 def _open_bag(place: Path, options: SourceOptions, say: Callable[[str], None]) -> Source:

@@ -12,7 +12,7 @@ import numpy as np
 
 from headvox.data import F64, BadFrame, Frame
 from headvox.errors import HeadvoxError
-from headvox.frames import transform, unproject
+from headvox.frames import is_moving, transform, unproject
 from headvox.sources import Source, open_source
 from headvox.sources.bag import BagSource
 from headvox.sources.cloudfile import CloudFileSource, read_cloud_file
@@ -156,7 +156,7 @@ def _camera(label: str, camera: Camera, frames: list[RecordedFrame]) -> str:
     seconds = (shots[-1][0] - shots[0][0]) / 1e9
     rate = f"{(len(shots) - 1) / seconds:.1f} fps" if seconds > 0 else "one moment"
     first = shots[0][1].T_world_camera
-    moves = ", moving" if any(not np.array_equal(first, shot.T_world_camera) for _, shot in shots) else ""
+    moves = ", moving" if is_moving(shot.T_world_camera for _, shot in shots) else ""
     return f"{size}, {len(shots)} images, {rate}, {_where(first)}, {_tilt(first)}{moves}"
 
 

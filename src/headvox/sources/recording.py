@@ -14,7 +14,7 @@ import numpy as np
 
 from headvox.data import F64, U16, BadFrame, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
-from headvox.frames import as_rigid
+from headvox.frames import as_rigid, is_moving
 
 FILE = "recording.json"
 FORMAT, VERSION = "headvox-recording", 1
@@ -94,6 +94,14 @@ class RecordingSource:
             return Frame(recorded.stamp_ns, depths=tuple(self._image(shot) for shot in recorded.shots))
         except HeadvoxError as error:
             return BadFrame(recorded.stamp_ns, str(error))
+
+    def moving(self) -> list[str]:
+        """Return the names of the cameras that move, by what the recording says."""
+        places: dict[str, list[F64]] = {camera: [] for camera in self.cameras}
+        for frame in self.frames:
+            for shot in frame.shots:
+                places[shot.camera].append(shot.T_world_camera)
+        return [camera for camera, each in places.items() if is_moving(each)]
 
     def close(self) -> None:
         """End the iteration."""

@@ -11,6 +11,7 @@ from headvox.data import F64, BadFrame, Cloud, DepthImage, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.fuse import Region
+from headvox.scale import wrong_scale
 
 STAMP_LIMIT_NS = 2**62
 NUMBERS = (int, float, np.integer, np.floating)
@@ -136,20 +137,17 @@ def nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
     """Say why no point was kept: nothing measured at all, another unit, or another place."""
     where = f"within {region.radius_m:g} m of ({', '.join(f'{v:.2f}' for v in region.centre)})"
     for cloud in frame.clouds:
-        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
-        finite = distance[np.isfinite(distance)]
+        finite = cloud.points[np.isfinite(cloud.points).all(axis=1)].astype(np.float64)
         if len(finite) == 0:
             what = f"{cloud.name}: all {len(cloud.points)} points are NaN or infinite."
             return HeadvoxError(what, "Is the sensor covered, or too near?")
-        middle = float(np.median(finite))
-        if middle > 100.0:
-            return HeadvoxError(
-                f"{cloud.name}: half of the points are more than {middle:.0f} m away: are they in millimetres?",
-                "headvox expects metres: scale them by 0.001.",
-            )
+        error = _wrong_scale_of(cloud, finite, region)
+        if error is not None:
+            return error
+        nearest = float(np.linalg.norm(finite, axis=1).min())
         return HeadvoxError(
             f"{cloud.name}: none of {len(cloud.points)} points is {where} and between {region.min_height_m:g} m and "
-            f"{region.max_height_m:g} m high (nearest: {finite.min():.2f} m from the origin of its frame).",
+            f"{region.max_height_m:g} m high (nearest: {nearest:.2f} m from the origin of its frame).",
             "Set centre, max_range_m, min_height_m or max_height_m, or give the sensor's transform.",
         )
     if all(not image.depth.any() for image in frame.depths):
@@ -161,3 +159,8 @@ def nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
         f"{region.max_height_m:g} m high.",
         "Check T_world_camera and depth_scale, or set max_range_m, min_height_m or max_height_m.",
     )
+
+
+def _wrong_scale_of(cloud: Cloud, finite: F64, region: Region) -> HeadvoxError | None:
+    """Judge a cloud's finite points where it has them if its sensor's place is known, else about the region."""
+    return wrong_scale(finite, cloud.name, region.centre if cloud.T_world_sensor is None else None)

@@ -59,6 +59,7 @@ def depth_image(depth, **camera):
 
 def test_wrong_points(make):
     good = two_busts()
+    room = np.random.default_rng(0).uniform([1.0, -3.0, -1.0], [5.0, 3.0, 1.0], (500, 3)).astype(np.float32)
     detector = make()
     for points, told in [
         (good[:, :2], r"points: expected points of shape \(N, 3\), got \(1600, 2\)"),
@@ -72,10 +73,13 @@ def test_wrong_points(make):
         (np.empty((0, 3), np.float32), "points: the cloud is empty"),
         (np.full((5, 3), np.nan, np.float32), "all 5 points are NaN or infinite"),
         (np.full((5, 3), np.inf, np.float32), "all 5 points are NaN or infinite"),
-        ((good * 1000).astype(np.float32) + np.float32(2000), "are they in millimetres"),
+        ((room * 1000).astype(np.float32), r"points: .* \(0.00, 0.00, 0.00\) .* these look like millimetres"),
+        ((room * 100).astype(np.float32), "their middle: metres are expected"),
+        ((room * 39.37).astype(np.float32), "their middle: metres are expected"),
+        (room + np.float32([5e5, 4.5e6, 0.0]), "m or more from .*, though they lie together"),
         (good + np.float32(9), r"none of 1600 points is within 0.7 m of \(0.00, 0.00, 0.00\)"),
         (np.float32([[0.0, 0.0, 0.6]]), "between -0.5 m and 0.5 m high"),
-        (np.full((5, 3), 1e30, np.float32), "millimetres"),
+        (np.full((5, 3), 1e30, np.float32), "though they lie together"),
     ]:
         with pytest.raises(HeadvoxError, match=told) as error:
             detector.detect(points)

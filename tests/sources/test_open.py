@@ -156,7 +156,15 @@ def test_check_cloud_accepts_a_room_with_holes():
         (np.zeros((5, 4), np.float32), r"expected points as \(N, 3\) float32, got shape \(5, 4\)"),
         (np.zeros((5, 3), np.int32), "of int32"),
         (POINTS * 1000, "these look like millimetres"),
-        (POINTS + np.float32(5000), "m from the origin, expected less than 100 m"),
+        (
+            POINTS + np.float32(5000),
+            "m or more from the origin, though they lie together: expected less than 100 m",
+        ),
+        (
+            POINTS * 200,
+            r"points are 375\.\d or more from the origin and .* their middle: metres are expected",
+        ),
+        (POINTS * 1e9, "metres are expected"),
     ],
 )
 def test_check_cloud_refuses_in_one_line(points, message):

@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from headvox.data import F32, F64
 from headvox.errors import HeadvoxError
+from headvox.scale import wrong_scale
 
 Column = npt.NDArray[Any]
 
-FARTHEST_MEDIAN_M = 100.0  # no indoor sensor sees its typical point from farther away
 _SAMPLE = 10_000  # points that are looked at: every frame passes here
 
 
@@ -60,26 +60,11 @@ def check_cloud(points: F32, name: str) -> None:
             f"{name}: all {len(points)} points are NaN or infinite, expected some finite ones.",
             "Check how it was recorded.",
         )
-    _check_scale(seen, name)
+    error = wrong_scale(seen, name)
+    if error is not None:
+        raise error
 
 
 def _finite_rows(points: F32) -> F64:
     rows: F64 = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     return rows
-
-
-def _check_scale(points: F64, name: str) -> None:
-    distance = float(np.median(np.linalg.norm(points, axis=1)))
-    if distance <= FARTHEST_MEDIAN_M:
-        return
-    spread = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
-    if spread > FARTHEST_MEDIAN_M:
-        raise HeadvoxError(
-            f"{name}: points lie {distance:.4g} from the origin and {spread:.4g} apart, expected metres; "
-            "these look like millimetres.",
-            "Divide them by 1000.",
-        )
-    raise HeadvoxError(
-        f"{name}: points lie {distance:.4g} m from the origin, expected less than {FARTHEST_MEDIAN_M:g} m.",
-        "Move the cloud near the origin, or divide by 1000 if it is in millimetres.",
-    )

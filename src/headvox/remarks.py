@@ -49,8 +49,11 @@ class Remarks:
         self._more = 0
 
     def ended(self, source: Source, report: Report) -> None:
-        """Tell why nothing may have been found, at the end of a run."""
+        """Tell at the end of a run why nothing may have been found, and what its velocities depend on."""
+        from headvox.sources.folder import FolderSource
         from headvox.sources.recording import RecordingSource
 
+        if report.ids and isinstance(source, FolderSource) and source.rate_hz is None:
+            self._tell("velocities are for 30 clouds a second, for files have no stamps: see --rate")
         if report.heads == 0 and not report.interrupted and not isinstance(source, RecordingSource):
             self._tell("no head in any frame: headvox expects metres, and a world whose z points up")

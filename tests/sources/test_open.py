@@ -10,11 +10,16 @@ import pytest
 from cloud_writers import POINTS, SQUARE, npy, npz, pcd, ply, recording
 from PIL import Image
 
+from headvox.commands.convert import convert
 from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
+from headvox.remarks import Remarks
+from headvox.run import Report
 from headvox.sources import open_source
 from headvox.sources.check import as_points, check_cloud
+from headvox.sources.describe import describe
 from headvox.sources.folder import natural_key
+from headvox.sources.options import SourceOptions
 
 KINDS = {
     "ply": ply(),
@@ -63,6 +68,42 @@ def test_a_folder_is_in_natural_order_a_thirtieth_of_a_second_apart(tmp_path):
     assert source.length == len(frames) == 4
     assert [frame.clouds[0].name for frame in frames] == names
     assert [frame.stamp_ns for frame in frames] == [0, 33_333_333, 66_666_666, 99_999_999]
+
+
+def test_the_rate_of_a_folder_is_what_is_said(tmp_path):
+    for index in range(3):
+        (tmp_path / f"{index}.ply").write_bytes(ply())
+    source = open_source(tmp_path, SourceOptions(rate_hz=10.0))
+    assert [frame.stamp_ns for frame in source] == [0, 100_000_000, 200_000_000]
+    rows = dict(describe(tmp_path, SourceOptions(rate_hz=10.0)))
+    assert rows["duration"] == "0.20 s, files have no stamps and are 10 a second"
+    assert (
+        "0.07 s, files have no stamps and are taken to be 1/30 s apart"
+        in dict(describe(tmp_path))["duration"]
+    )
+    for rate in (0.0, -10.0, 1e9, float("nan")):
+        with pytest.raises(HeadvoxError, match=r"--rate: expected 0\.001 to 10000 clouds a second, got"):
+            open_source(tmp_path, SourceOptions(rate_hz=rate))
+    recording(tmp_path / "r")
+    convert(open_source(tmp_path / "r"), tmp_path / "r.mcap")
+    for stamped in ("r", "0.ply", "r.mcap"):
+        with pytest.raises(HeadvoxError, match=r"--rate (is )?for folders of clouds"):
+            open_source(tmp_path / stamped, SourceOptions(rate_hz=10.0))
+    with pytest.raises(HeadvoxError, match="realsense:: --rate is for folders"):
+        open_source("realsense:", SourceOptions(rate_hz=10.0))
+
+
+def test_a_run_whose_velocities_depend_on_a_rate_that_nobody_said_tells_it_once(tmp_path):
+    (tmp_path / "0.ply").write_bytes(ply())
+
+    def told(ids: int | None, rate_hz: float | None) -> list[str]:
+        lines: list[str] = []
+        source = open_source(tmp_path, SourceOptions(rate_hz=rate_hz))
+        Remarks(lines.append).ended(source, Report(frames=3, heads=3, ids=ids))
+        return lines
+
+    assert told(1, None) == ["velocities are for 30 clouds a second, for files have no stamps: see --rate"]
+    assert told(None, None) == told(0, None) == told(1, 10.0) == []
 
 
 def test_natural_order():

@@ -58,6 +58,7 @@ def source_options_of(args: argparse.Namespace) -> SourceOptions:
         topics=tuple(args.topic),
         frame=args.frame,
         extrinsics=args.extrinsics,
+        rate_hz=args.rate,
         T_world_mount=None if args.mount is None else mount(*args.mount),
     )
 
@@ -152,8 +153,8 @@ def either(names: Sequence[str]) -> str:
 
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:
-    """Add a flag for each thing that a bag may not tell by itself."""
-    group = parser.add_argument_group("bags and cameras", "what they do not tell by themselves")
+    """Add a flag for each thing that a source may not tell by itself."""
+    group = parser.add_argument_group("bags, cameras and folders", "what they do not tell by themselves")
     group.add_argument(
         "--topic", action="append", default=[], metavar="NAME", help="read this topic (again for another)"
     )
@@ -169,6 +170,13 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
         "--extrinsics",
         metavar="FILE",
         help="TOML or JSON that tells where each camera stands: see headvox align",
+    )
+    group.add_argument(
+        "--rate",
+        dest="rate",
+        type=number,
+        metavar="HZ",
+        help="clouds of a folder a second (30): files have no stamps",
     )
 
 

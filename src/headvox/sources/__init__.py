@@ -46,13 +46,14 @@ def open_source(
 
     A folder with a ``recording.json`` (or that file itself) is a depth recording; a folder with a ``metadata.yaml``, or
     a file that begins like one, is a bag of ROS 1 or ROS 2; any other folder is a sequence of point-cloud files in
-    natural order of their names, 1/30 s apart, and a file is one cloud: ply, pcd, npy or npz. A bag that the SDK of
-    RealSense recorded is played by it. ``realsense:`` is the camera that is plugged in, ``realsense:SERIAL,SERIAL``
-    are several.
+    natural order of their names, 1/30 s apart unless ``options`` say otherwise, and a file is one cloud: ply, pcd, npy
+    or npz. A bag that the SDK of RealSense recorded is played by it. ``realsense:`` is the camera that is plugged in,
+    ``realsense:SERIAL,SERIAL`` are several.
 
     Args:
         path: of a file or a folder, or ``realsense:``.
-        options: what a bag or a camera does not tell by itself; a depth recording takes ``extrinsics``, others none.
+        options: what a bag or a camera does not tell by itself; a depth recording takes ``extrinsics``, a
+            folder of clouds ``rate_hz``, others none.
         say: told what is assumed about a bag, or overruled in a recording, a line each; by default these are warnings.
 
     Returns:
@@ -67,7 +68,7 @@ def open_source(
     from headvox.ros.bagfile import is_bag
     from headvox.sources.cloudfile import CloudFileSource
     from headvox.sources.folder import FolderSource
-    from headvox.sources.options import SourceOptions, check_unused
+    from headvox.sources.options import SourceOptions, check_stamped, check_unused
     from headvox.sources.recording import FILE
 
     place = Path(path)
@@ -75,6 +76,7 @@ def open_source(
         from headvox.sources.realsense import RealSenseLive
 
         serials = [serial for serial in os.fspath(path).partition(":")[2].split(",") if serial]
+        check_stamped(options or SourceOptions(), os.fspath(path))
         return RealSenseLive(serials, options or SourceOptions(), say or _warn)
     try:
         is_recording = place.name == FILE or (place / FILE).is_file()
@@ -82,9 +84,11 @@ def open_source(
             return _open_bag(place, options or SourceOptions(), say or _warn)
         if is_recording:
             return _open_recording(place if place.is_dir() else place.parent, options, say or _warn)
-        check_unused(options, place.name)
         if place.is_dir():
-            return FolderSource(place)
+            options = options or SourceOptions()
+            check_unused(replace(options, rate_hz=None), place.name)
+            return FolderSource(place, options.rate_hz)
+        check_unused(options, place.name)
     except OSError as error:
         raise HeadvoxError(f"{place}: cannot be read: {error.strerror}.", "Check the path.") from None
     except ValueError as error:  # a NUL in the path
@@ -115,8 +119,10 @@ def _open_recording(folder: Path, options: SourceOptions | None, say: Callable[[
 def _open_bag(place: Path, options: SourceOptions, say: Callable[[str], None]) -> Source:
     from headvox.ros.bagfile import Bag
     from headvox.sources.bag import BagSource
+    from headvox.sources.options import check_stamped
     from headvox.sources.realsense import RealSenseFile, is_recorded
 
+    check_stamped(options, place.name)
     bag = Bag(place)
     if is_recorded(bag.topics):
         bag.close()

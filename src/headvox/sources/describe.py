@@ -17,7 +17,7 @@ from headvox.sources import Source, open_source
 from headvox.sources.bag import BagSource
 from headvox.sources.cloudfile import CloudFileSource, read_cloud_file
 from headvox.sources.content import CloudFile
-from headvox.sources.folder import FRAME_NS, FolderSource
+from headvox.sources.folder import FolderSource
 from headvox.sources.options import SourceOptions, listed
 from headvox.sources.realsense import RealSenseFile
 from headvox.sources.recording import Camera, RecordedFrame, RecordingSource
@@ -79,12 +79,11 @@ def _file_rows(cloud: CloudFile) -> Rows:
 
 def _folder_rows(source: FolderSource) -> Rows:
     count = len(source.paths)
+    apart = "are taken to be 1/30 s apart" if source.rate_hz is None else f"are {source.rate_hz:g} a second"
+    seconds = source.stamp_ns(count - 1) / 1e9
     rows = [
         ("frames", f"{count} files"),
-        (
-            "duration",
-            f"{(count - 1) * FRAME_NS / 1e9:.2f} s, files have no stamps and are taken to be 1/30 s apart",
-        ),
+        ("duration", f"{seconds:.2f} s, files have no stamps and {apart}"),
     ]
     path, cloud = _first_readable(source.paths)
     return [*rows, ("described file", path.name), *_file_rows(cloud)]

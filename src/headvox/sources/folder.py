@@ -10,11 +10,12 @@ from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
 from headvox.sources.cloudfile import OF_DEPTH, SUFFIXES, read_cloud
 
-FRAME_NS = 33_333_333  # files have no stamps: they are taken to be 30 a second
+FRAME_NS = 33_333_333  # files have no stamps: unless somebody says, they are taken to be 30 a second
+RATES_HZ = 0.001, 10_000.0  # what a rate may be
 
 
 class FolderSource:
-    """The point-cloud files of a folder in natural order of their names, as frames 1/30 s apart.
+    """The point-cloud files of a folder in natural order of their names, 1/30 s apart or as ``rate_hz`` says.
 
     Files that do not end in ply, pcd, npy or npz, hidden files and folders inside are passed over. A file
     that cannot be used is a :class:`~headvox.data.BadFrame`, and keeps its place in time.
@@ -22,11 +23,18 @@ class FolderSource:
 
     length: int | None
 
-    def __init__(self, folder: Path) -> None:
-        """Raise HeadvoxError where the folder cannot be read or has no point-cloud file."""
+    def __init__(self, folder: Path, rate_hz: float | None = None) -> None:
+        """Raise HeadvoxError where the folder cannot be read or has no point-cloud file, or of a rate that is none."""
+        if rate_hz is not None and not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+            raise HeadvoxError(
+                f"--rate: expected {RATES_HZ[0]:g} to {RATES_HZ[1]:g} clouds a second, got {rate_hz!r}.",
+                "Say how many were recorded a second.",
+            )
         self.name = folder.name or str(folder)
         self.paths = _cloud_paths(folder)
         self.length = len(self.paths)
+        self.rate_hz = rate_hz
+        """As it was given; None: it is assumed."""
         self._open = True
 
     def __iter__(self) -> Iterator[Frame | BadFrame]:
@@ -34,13 +42,17 @@ class FolderSource:
         for index, path in enumerate(self.paths):
             if not self._open:
                 return
-            stamp_ns = index * FRAME_NS
+            stamp_ns = self.stamp_ns(index)
             try:
                 frame = Frame(stamp_ns, clouds=(read_cloud(path),))
             except HeadvoxError as error:
                 yield BadFrame(stamp_ns, str(error))
             else:
                 yield frame
+
+    def stamp_ns(self, index: int) -> int:
+        """Return the stamp of a file, by its place in the order."""
+        return index * FRAME_NS if self.rate_hz is None else round(index * 1e9 / self.rate_hz)
 
     def close(self) -> None:
         """End the iteration."""

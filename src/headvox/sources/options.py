@@ -31,6 +31,8 @@ class SourceOptions:
     """Where that frame is, or the one sensor (x forward, y left, z up), in the world: see :func:`mount`."""
     extrinsics: str | None = None
     """A file that says where each camera stands, for live cameras: see docs/conventions.md."""
+    rate_hz: float | None = None
+    """How many clouds of a folder are a second; they have no stamps."""
 
 
 def check_unused(options: SourceOptions | None, name: str) -> None:
@@ -45,12 +47,23 @@ def check_unused(options: SourceOptions | None, name: str) -> None:
         or options.frame is not None
         or options.T_world_mount is not None
         or options.extrinsics is not None
+        or options.rate_hz is not None
     ):
         raise HeadvoxError(
             f"{name}: --topic, --frame and --mount are for bags and live cameras, --extrinsics for recordings "
-            "and live cameras only.",
+            "and live cameras, --rate for folders of clouds only.",
             "Leave them out.",
         )
+
+
+def check_stamped(options: SourceOptions, name: str) -> None:
+    """Refuse a rate for a source that has stamps of its own.
+
+    Raises:
+        HeadvoxError: it is set.
+    """
+    if options.rate_hz is not None:
+        raise HeadvoxError(f"{name}: --rate is for folders of clouds, this has stamps.", "Leave it out.")
 
 
 def mount(x: float, y: float, z: float, roll_deg: float, pitch_deg: float, yaw_deg: float) -> F64:

@@ -30,11 +30,8 @@ from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
 from headvox.synth.spread import spread_points
 
-EVALUATION = (
-    0x2F61D,
-    0x4D21B,
-    0x4D21C,
-)  # nothing was fitted to their people; earlier versions looked at 0xE7A1, 0x6A5E, 0x3C19
+# Nothing was fitted to the people of these seeds; earlier versions looked at 0xE7A1, 0x6A5E and 0x3C19.
+EVALUATION = 0x2F61D, 0x4D21B, 0x4D21C
 KINDS = {
     "face, 1 m": (1.0, 0, 1), "face, 1.5 m": (1.5, 0, 1), "face, 2 m": (2.0, 0, 1), "face, 3 m": (3.0, 0, 1),
     "profile, 1 m": (1.0, 90, 1), "profile, 1.5 m": (1.5, 90, 1), "profile, 2 m": (2.0, 90, 1),

@@ -8,10 +8,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from walks import MS, STANDING, at, follow, heads, image, walk
+import scenes
+from scipy.spatial.transform import Rotation
+from walks import MS, PLACE, STANDING, at, follow, heads, image, walk
 
 from headvox.config import TrackerConfig
-from headvox.data import Frame, State, Tracks
+from headvox.data import DepthImage, Frame, Heads, State, Tracks
 from headvox.errors import HeadvoxError
 from headvox.tracking.noise import measurement_noise
 from headvox.tracking.tracker import Tracker
@@ -278,6 +280,73 @@ def test_the_same_heads_make_the_same_tracks() -> None:
         return tracks
 
     assert_same(run(), run())
+
+
+def turning(k: int) -> Heads:
+    """Return the head of somebody who walks, and turns ever faster."""
+    turn = Rotation.from_euler("z", 0.002 * k**2).as_quat()
+    place = (PLACE[0], 0.01 * k, PLACE[2])
+    return replace(heads(place), quaternions=turn[None], rotation_covariances=1e-3 * np.eye(3)[None])
+
+
+def lost_and_found(tracker: Tracker, *missed: DepthImage, new: TrackerConfig | None = None) -> list[Tracks]:
+    """Show a head for 3 s, for 5 s only ``missed``, then the head; ``new`` is the configuration from 2 s on."""
+    tracks = []
+    for k in range(85):
+        if k == 20 and new is not None:
+            tracker.config = new
+        hidden = 30 <= k < 80
+        frame = Frame(at(k).stamp_ns, depths=missed if hidden else ())
+        tracks.append(tracker.update(heads() if hidden else turning(k), frame))
+    return tracks
+
+
+def joined(run: list[Tracks]) -> Tracks:
+    """Return the tracks of all frames of a run, one after the other."""
+    names = [field.name for field in fields(Tracks) if field.name != "stamp_ns"]
+    rows = {name: np.concatenate([getattr(tracks, name) for tracks in run]) for name in names}
+    return Tracks(stamp_ns=run[-1].stamp_ns, **rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "missed"),
+    [
+        ("empty_s", 2.0, [image(4.0)]),
+        ("missed_s", 2.0, [image(0.0)]),
+        ("hidden_s", 1.0, [image(1.0)]),
+        ("out_of_view_s", 2.0, [image(4.0, T=scenes.looking_along_x(5.0, 0.0, 1.6))]),
+        ("remember_s", 1.0, []),
+        ("speed_change_m_s", 0.1, []),
+        ("turn_change_deg_s", 20.0, []),
+        ("strong_score", 8.0, []),
+        ("confirm_hits", 4, []),
+    ],
+)
+def test_a_configuration_that_is_assigned_counts_as_one_that_was_there_first(name, value, missed) -> None:
+    config, assigned = TrackerConfig(**{name: value}), Tracker()
+    assigned.config = config
+    assert assigned.config is config
+    every = joined(lost_and_found(Tracker(config), *missed))
+    assert_same(joined(lost_and_found(assigned, *missed)), every)
+    with pytest.raises(AssertionError):  # the setting does something here
+        assert_same(joined(lost_and_found(Tracker(), *missed)), every)
+
+
+def test_a_configuration_may_be_assigned_meanwhile_and_the_tracks_stay() -> None:
+    tracker = Tracker()
+    tracks = lost_and_found(tracker, image(4.0), new=TrackerConfig(empty_s=2.0, present_s=10.0))
+    usual = lost_and_found(Tracker(), image(4.0))
+    assert_same(tracks[19], usual[19])
+    assert tracks[20].ids.tolist() == [1]
+    followed, usually = ([len(one) > 0 for one in run[30:80]] for run in (tracks, usual))
+    assert sum(followed) > 2 * sum(usually)
+
+
+def test_only_a_configuration_may_be_assigned() -> None:
+    tracker = Tracker()
+    with pytest.raises(HeadvoxError, match="Expected a TrackerConfig, got "):
+        tracker.config = {"empty_s": 1.0}
+    assert tracker.config == TrackerConfig()
 
 
 def test_nothing_that_is_handed_out_changes_later() -> None:

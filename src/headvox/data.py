@@ -17,6 +17,8 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from headvox.errors import HeadvoxError
+
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -99,6 +101,13 @@ def unknown(*shape: int) -> F64:
     return numbers
 
 
+_ROWS: dict[str, tuple[int, ...]] = {
+    "centres": (3,), "quaternions": (4,), "radii": (), "scores": (),
+    "centre_covariances": (3, 3), "rotation_covariances": (3, 3), "sure": (),
+}  # fmt: skip
+"""What a head has in each array of :class:`Heads`."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Heads:
     """The heads found in one frame, as a structure of arrays, best score first.
@@ -123,11 +132,15 @@ class Heads:
     sure: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
 
     def __post_init__(self) -> None:
-        if len(self.sure) != len(self.scores):
-            object.__setattr__(self, "sure", np.ones(len(self.scores), np.bool_))
+        n = len(self.scores)
+        if len(self.sure) == 0:
+            object.__setattr__(self, "sure", np.ones(n, np.bool_))
         for name in ("centre_covariances", "rotation_covariances"):
-            if len(getattr(self, name)) != len(self.scores) or getattr(self, name).ndim != 3:
-                object.__setattr__(self, name, unknown(len(self.scores), 3, 3))
+            if len(getattr(self, name)) == 0:
+                object.__setattr__(self, name, unknown(n, 3, 3))
+        for name, row in _ROWS.items():
+            if getattr(getattr(self, name), "shape", None) != (n, *row):
+                raise _other_shape(name, (n, *row), getattr(self, name))
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -145,6 +158,12 @@ class Heads:
             for (x, y, z), s in zip(self.centres, self.scores, strict=True)
         ]
         return f"Heads({len(self)}: {'; '.join(told)})" if told else "Heads(0)"
+
+
+def _other_shape(name: str, shape: tuple[int, ...], got: object) -> HeadvoxError:
+    told = getattr(got, "shape", type(got).__name__)
+    what = f"Heads: {name}: expected an array of shape {shape}, a row for each of the scores, got {told}."
+    return HeadvoxError(what, "Give a row for each head, or leave out what is not known.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ from headvox.config import DetectorConfig, given_or_default
 from headvox.cuda.detect import DEVICE_STAGES, OnDevice
 from headvox.cuda.device import BATCH, DeviceLost, use_device
 from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
+from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners
@@ -78,12 +79,12 @@ class Detector:
         backend: str | None = None,
         note: Callable[[str], None] | None = None,
     ) -> None:
-        self.config = given_or_default(config, DetectorConfig)
+        self._config = given_or_default(config, DetectorConfig)
         if backend is not None:
-            self.config = replace(self.config, backend=backend)
+            self._config = replace(self._config, backend=backend)
         self._note = note or _warn
-        self.cascade = compile_cascade(load_cascade(self.config.cascade), self.config.voxel_m)
-        self.on_device = use_device(self.config.backend)
+        self.cascade = compile_cascade(load_cascade(self._config.cascade), self._config.voxel_m)
+        self.on_device = use_device(self._config.backend)
         """Whether frames are looked at on a GPU; it ends when the GPU fails."""
         self.device: OnDevice | None = None
         """What looks at them there, once there was a frame."""
@@ -91,8 +92,8 @@ class Detector:
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
         self._alone = Turns(("This Detector is at work in another thread.", "Give each thread its own."))
-        self._threads = Threads(self.config.threads)
-        self._placing = Placing(self.config)
+        self._threads = Threads(self._config.threads)
+        self._placing = Placing(self._config)
         self._most_sensors = 0
         self._memory: Memory | None = None
         if (
@@ -103,9 +104,20 @@ class Detector:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Say how to make another one: working memory and threads are of this one."""
-        return partial(type(self), note=self._note), (self.config,)
+        return partial(type(self), note=self._note), (self._config,)
 
     # ------------------------------------------------------------------------------------------- the public calls
+
+    @property
+    def config(self) -> DetectorConfig:
+        """The settings that it was made with: others take another detector."""
+        return self._config
+
+    @config.setter
+    def config(self, _: object) -> None:
+        raise HeadvoxError(
+            "The settings of a Detector are fixed when it is made.", "Make a new one: Detector(config)."
+        )
 
     def detect(self, points: npt.NDArray[np.float32], T_world_sensor: npt.ArrayLike | None = None) -> Heads:
         """Return the heads in ``points``, (N, 3) float32 in metres, NaN where invalid.
@@ -197,7 +209,7 @@ class Detector:
     def _detect_together(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
         """Return the heads in up to :data:`BATCH` frames: at once on a GPU; without, or when it fails, one by one."""
         if self.on_device:
-            self.device = self.device or OnDevice(self.config, self.cascade)
+            self.device = self.device or OnDevice(self._config, self.cascade)
             try:
                 heads = self.device.detect(frames, expected, self.stage_ms)
                 self.candidates = self.device.candidates
@@ -357,8 +369,8 @@ class Detector:
             peaks = peaks[found]
             if sees and len(cells):
                 self._look_about(frame, S, cells, judge, memory, scores)
-        least = least_score(self.config, self.cascade.source, blind=memory.sees and not sees)
-        centres, slack = memory.centres(cells), slack_of(self.config, expected)
+        least = least_score(self._config, self.cascade.source, blind=memory.sees and not sees)
+        centres, slack = memory.centres(cells), slack_of(self._config, expected)
         hopeful = least_before(least, self.cascade.relief, sees)
         kept = np.flatnonzero(keep(centres, scores, hopeful, slack, expected, memory.lattice.voxel_m))
         return Judged(cells[kept], centres[kept], scores[kept], peaks[kept], least)
@@ -403,17 +415,17 @@ class Detector:
         cells, centres, scores, peaks, least = judged
         if len(cells) == 0:
             return Heads()
-        spheres = None if self.config.refine == "none" else self._fit_spheres(cells, memory)
+        spheres = None if self._config.refine == "none" else self._fit_spheres(cells, memory)
         kept, centres, radii = best_apart(centres, scores, spheres, haired=knows_an_origin(frame))
         scores, relief = scores[kept], self.cascade.relief
-        limits = (least, slack_of(self.config, expected), expected, memory.lattice.voxel_m)
+        limits = (least, slack_of(self._config, expected), expected, memory.lattice.voxel_m)
         if relief is not None and asks_cameras(frame, memory.sees):
             again, scores = look_again(centres, radii, scores, frame.depths, relief, *limits)
             kept, centres, radii = kept[again], centres[again], radii[again]
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks[kept]]]
         heads = stated(centres, radii, scores, least, yaws)
-        if self.config.refine != "pose":
+        if self._config.refine != "pose":
             return heads
         poses = fit_poses(frame, heads.centres[:MOST_POSES], memory.fits, self._threads, expected)
         rule = self.cascade.source.verification
@@ -448,8 +460,8 @@ class Detector:
         """Return the working memory, made anew only for another cascade or a region of another shape."""
         lattice, memory = self._placing.lattice(frame, self.cascade), self._memory
         if memory is None or memory.cascade is not self.cascade or memory.lattice.shape != lattice.shape:
-            poses = self.config.refine == "pose"
-            memory = self._memory = Memory(lattice, self.cascade, self.config.threads, poses)
+            poses = self._config.refine == "pose"
+            memory = self._memory = Memory(lattice, self.cascade, self._config.threads, poses)
         if memory.lattice is not lattice:
             memory.place(lattice)
         return memory

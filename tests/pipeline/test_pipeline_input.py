@@ -195,6 +195,14 @@ def test_what_is_masked_or_imaginary_is_not_passed_over(make):
         make().detect_depth(replace(image, T_world_camera=np.eye(4) + 0j))
 
 
+def test_settings_are_not_changed_half(make):
+    detector = make()
+    config = detector.config
+    with pytest.raises(HeadvoxError, match=r"fixed when it is made\. Make a new one"):
+        detector.config = replace(config, max_range_m=1.0)
+    assert detector.config is config
+
+
 def test_many_frames_may_come_one_by_one(make):
     detector = make(min_score=-2.0)
     frames = [camera_frame(k) for k in range(3)] * 4

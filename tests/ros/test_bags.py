@@ -92,6 +92,16 @@ def test_two_cameras_of_any_kind_of_bag(tmp_path, kind):
         np.testing.assert_allclose(right.T_world_camera, RIGHT @ OPTICAL, atol=1e-12)
 
 
+def test_the_z_of_the_earth_points_to_the_pole_so_heads_are_in_the_map(tmp_path):
+    maker, T = Maker(), mount(4.7e6, 1.7e5, 4.2e6, 0, 0, 0)
+    messages = [("/tf_static", START, maker.transform(0, "earth", "map", T))]
+    messages.append(("/tf_static", START, maker.transform(0, "map", "base_link", np.eye(4))))
+    source, notes = opened(write_bag(tmp_path, "mcap", messages + rig(maker)))
+    assert "heads are in the frame 'map'" in notes[0]
+    assert "earth" in notes[0]  # for --frame
+    np.testing.assert_allclose(next(iter(source)).depths[0].T_world_camera, LEFT @ OPTICAL, atol=1e-12)
+
+
 def test_a_moving_robot_is_placed_by_transforms_that_come_after_the_image(tmp_path):
     source, notes = opened(write_bag(tmp_path, "mcap", rig(Maker(), 6, moving=True)))
     *frames, last = source

@@ -93,6 +93,23 @@ def test_the_last_stamp_of_ros_comes_back(tmp_path):
     assert [frame.stamp_ns for frame in open_source(tmp_path / "a.mcap")] == [last]
 
 
+def test_cameras_whose_names_come_to_the_same_stay_apart(tmp_path):
+    lens, names = Intrinsics(4, 3, 5.0, 6.0, 1.5, 1.0, 0.001), ["cam a", "cam_a", "左", "右"]
+    values = {name: np.full((3, 4), 1000 + k, np.uint16) for k, name in enumerate(names)}
+
+    def frame(k: int, seen: list[str]) -> Frame:
+        return Frame(STAMP + k, (), tuple(DepthImage(name, values[name], lens, np.eye(4)) for name in seen))
+
+    convert(Listed(frame(0, names[1:]), frame(1, names)), tmp_path / "a.mcap")  # the first one comes late
+    first = {
+        topic: m.data.view(np.uint16)[0] for topic, stamp, m in read(tmp_path / "a.mcap") if "image" in topic
+    }
+    topics = [f"/{name}/depth/image_rect_raw" for name in ("cam_a", "sensor", "sensor_2", "cam_a_2")]
+    assert first == dict(zip(topics, [1001, 1002, 1003, 1000], strict=True))
+    places = [m for topic, _, m in read(tmp_path / "a.mcap") if topic == "/tf"]
+    assert len({place.child_frame_id for place in places[-1].transforms}) == 4
+
+
 def test_clouds_and_other_scales_come_back(tmp_path):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], (1.0, 2.0, 3.0)

@@ -74,7 +74,7 @@ class HeadDetector(SensorNode):
         config = config_from(DetectorConfig, "detector", values)
         warm_up(config)
         self._detector = self._new_detector(config)
-        self._tracker = Tracker() if values["tracking"] else None
+        self._tracker = Tracker(config_from(TrackerConfig, "track", values)) if values["tracking"] else None
         self._board = outputs.MarkerBoard(self.get_parameter("marker_lifetime_s").value)
 
     def process(self, frame: Frame) -> None:
@@ -112,7 +112,9 @@ class HeadDetector(SensorNode):
             self._detector.close()
             self._detector = self._new_detector(config)
         if self._tracker is not None:
-            self._tracker.config = config_from(TrackerConfig, "track", values)
+            settings = config_from(TrackerConfig, "track", values)
+            if settings != self._tracker.config:
+                self._tracker.config = settings
 
     def _new_detector(self, config: DetectorConfig) -> Detector:
         return Detector(config, note=lambda text: self.get_logger().warning(text))

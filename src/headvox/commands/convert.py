@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import sys
 from collections.abc import Callable
@@ -36,7 +37,7 @@ def convert(
         HeadvoxError: the file cannot be made, the source not be read, or there is no frame in it that could be used: an
             older file stays then.
     """
-    file = McapFile(path)
+    file, names = McapFile(path), dict[str, str]()
     done = bad = 0
     try:
         for frame in source:
@@ -44,7 +45,7 @@ def convert(
                 on_bad(done, frame.reason)
                 bad += 1
             else:
-                _write(file, frame)
+                _write(file, frame, names)
             done += 1
             on_frame(done)
     finally:
@@ -53,11 +54,12 @@ def convert(
     return done, bad
 
 
-def _write(file: McapFile, frame: Frame) -> None:
+def _write(file: McapFile, frame: Frame, names: dict[str, str]) -> None:
+    """Write a frame; ``names`` keeps what the images of each sensor are called in the bag."""
     stamp = frame.stamp_ns
     places = []
     for image in frame.depths:
-        name = topic_name(image.name)
+        name = names.setdefault(image.name, _name_apart(image.name, names))
         header = header_of(stamp, f"{name}_depth_optical_frame")
         places.append(_place(stamp, header["frame_id"], image.T_world_camera))
         file.write(f"/{name}/depth/camera_info", CAMERA_INFO, stamp, camera_info(header, image))
@@ -74,6 +76,13 @@ def _write(file: McapFile, frame: Frame) -> None:
 def topic_name(name: str) -> str:
     """Return a name that ROS takes for a topic and a frame."""
     return re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_") or "sensor"
+
+
+def _name_apart(name: str, names: dict[str, str]) -> str:
+    """Return a name as of :func:`topic_name` that no other sensor in ``names`` has."""
+    plain, taken = topic_name(name), set(names.values())
+    numbered = (f"{plain}_{number}" for number in itertools.count(2))
+    return plain if plain not in taken else next(name for name in numbered if name not in taken)
 
 
 def depth_message(header: Content, image: DepthImage) -> Content:

@@ -18,7 +18,8 @@ from headvox.ros.transforms import NoTransform, TransformBuffer, set_from
 from headvox.sources.options import ASSUMED, SourceOptions, assumed_mount, listed, mounted
 
 # REP 105, and what simulations and calibrations call it: frames whose z is up, the first the farthest from the robot.
-WORLDS = ("earth", "map", "world", "odom", "base_footprint", "base_link")
+# Not its "earth": that one's z points to the pole.
+WORLDS = ("map", "world", "odom", "base_footprint", "base_link")
 SAME_PLACE_M, SAME_TURN = 0.06, 0.996  # two streams of one device; the cosine of 5 degrees
 _LOOKED_AT = 2000  # messages of /tf that the tree of frames is learnt from
 

@@ -65,19 +65,29 @@ class Tracker:
     """
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
-        self.config = given_or_default(config, TrackerConfig)
         self.untracked: Counter[str] = Counter()
         self.stamp_ns: int | None = None
         """Of the last frame that was tracked."""
         self._turns = Turns()
         self._last_id = 0
         self._roster = blank(0)
-        self._density = (self.config.speed_change_m_s * UPRIGHT) ** 2
-        self._turn_density = np.full(3, np.radians(self.config.turn_change_deg_s) ** 2)
-        self._lasts_s = _lasts_s(self.config)
-        self._longest_ns = _longest_s(self.config) * 1e9
+        self._set(given_or_default(config, TrackerConfig))
 
     # ------------------------------------------------------------------------------------------- the public calls
+
+    @property
+    def config(self) -> TrackerConfig:
+        """The settings. Others may be assigned at any time: from the next frame on the tracks there are go by them.
+
+        Raises:
+            HeadvoxError: something else is assigned.
+        """
+        return self._config
+
+    @config.setter
+    def config(self, config: TrackerConfig) -> None:
+        with self._turns:
+            self._set(given_or_default(config, TrackerConfig))
 
     def update(self, heads: Heads, frame: Frame) -> Tracks:
         """Take the heads found in ``frame``, world frame, and return every track at its stamp.
@@ -128,6 +138,14 @@ class Tracker:
         """How many heads were confirmed so far."""
         return self._last_id
 
+    def _set(self, config: TrackerConfig) -> None:
+        """Take settings, and what follows from them."""
+        self._config = config
+        self._density = (config.speed_change_m_s * UPRIGHT) ** 2
+        self._turn_density = np.full(3, np.radians(config.turn_change_deg_s) ** 2)
+        self._lasts_s = _lasts_s(config)
+        self._longest_ns = _longest_s(config) * 1e9
+
     # -------------------------------------------------------------------------------------------------- the steps
 
     def _take(self, heads: Heads, frame: Frame, stamp_ns: int) -> None:
@@ -145,7 +163,7 @@ class Tracker:
     def _is_next(self, stamp_ns: int) -> bool:
         """Whether time goes on; counts where it does not, and starts anew when it jumped back far."""
         if self.stamp_ns is not None and stamp_ns <= self.stamp_ns:
-            if self.stamp_ns - stamp_ns <= self.config.reset_s * 1e9:
+            if self.stamp_ns - stamp_ns <= self._config.reset_s * 1e9:
                 self.untracked["repeated" if stamp_ns == self.stamp_ns else "late"] += 1
                 return False
             self.untracked["resets"] += 1
@@ -156,7 +174,7 @@ class Tracker:
     def _predict(self, before_ns: int, stamp_ns: int) -> None:
         """Move every track on to ``stamp_ns``, and forget those that were not seen for too long."""
         kept = np.empty(len(self._roster), np.bool_)
-        if not turn_page(self._roster, stamp_ns, self._longest_ns, self.config.confirm_frames, kept):
+        if not turn_page(self._roster, stamp_ns, self._longest_ns, self._config.confirm_frames, kept):
             self._roster = self._roster[kept]
         self._move(self._roster, before_ns, stamp_ns)
         self.stamp_ns = stamp_ns
@@ -164,7 +182,7 @@ class Tracker:
     def _associate(self, heads: Heads, R: F64) -> tuple[I64, I64]:
         """Return the pairs of tracks and heads, by index, that are likeliest as a whole."""
         costs = np.empty((len(self._roster), len(heads)))
-        gate = self.config.gate_sigmas**2
+        gate = self._config.gate_sigmas**2
         price(self._roster, heads.centres, R, heads.sure, gate, self._now(), costs)
         return pairs(costs)
 
@@ -182,7 +200,7 @@ class Tracker:
             heads.radii,
             heads.scores,
             heads.sure,
-            self.config.strong_score,
+            self._config.strong_score,
         )
 
     def _age(self, centres: F64, frame: Frame, dt: float) -> None:
@@ -190,7 +208,7 @@ class Tracker:
 
         ``centres`` (M, 3) are those of the heads that were found.
         """
-        config, roster = self.config, self._roster
+        config, roster = self._config, self._roster
         states = np.full(len(roster), OUT_OF_VIEW)
         missed = np.flatnonzero(~roster["lost"] & (roster["seen_ns"] != self._now()))
         if len(missed):
@@ -203,7 +221,7 @@ class Tracker:
         roster = self._roster
         ready, kept = np.empty((2, len(roster)), np.bool_)
         any_ready, all_kept = judge_new(
-            roster, self.config.confirm_hits, self.config.confirm_frames, ready, kept
+            roster, self._config.confirm_hits, self._config.confirm_frames, ready, kept
         )
         if any_ready:
             new = np.flatnonzero(ready)
@@ -227,7 +245,7 @@ class Tracker:
         born["last"][:, 0], born["last_ns"][:, 0] = centres, self._now()
         born["place"], born["height"] = centres, centres[:, 2]
         born["radius"], born["score"] = heads.radii[new], heads.scores[new]
-        born["strength"] = np.minimum(heads.scores[new] / self.config.strong_score, MOST_STRENGTH)
+        born["strength"] = np.minimum(heads.scores[new] / self._config.strong_score, MOST_STRENGTH)
         born["x"][:, :, :3] = centres[:, None]
         born["P"][:, :, :3, :3] = R_centre[new, None]
         born["P"][:, MOVING, 3:, 3:] = np.diag(FIRST_SPEED_M_S**2)
@@ -237,7 +255,7 @@ class Tracker:
         born["C"][:, :3, :3] = R_turn[new]
         born["C"][:, 3:, 3:] = FIRST_RATE_RAD_S**2 * np.eye(3)
         self._roster = np.concatenate((self._roster, born), dtype=ROW)
-        if self.config.confirm_hits == 1:
+        if self._config.confirm_hits == 1:
             self._confirm()
 
     # ---------------------------------------------------------------------------------------------------- the rest

@@ -16,6 +16,8 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, TransformStamped
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
@@ -30,6 +32,13 @@ START_S = 240.0  # the first run of a new version compiles
 WAIT_S = 60.0  # far more than it takes: machines that test are busy
 CAMERAS = ("left", "right")
 STEP = NS // 10  # from one frame to the next
+KINDS = {
+    bool: (ParameterType.PARAMETER_BOOL, "bool_value"),
+    int: (ParameterType.PARAMETER_INTEGER, "integer_value"),
+    float: (ParameterType.PARAMETER_DOUBLE, "double_value"),
+    str: (ParameterType.PARAMETER_STRING, "string_value"),
+    list: (ParameterType.PARAMETER_DOUBLE_ARRAY, "double_array_value"),
+}
 
 
 class Process:
@@ -167,6 +176,19 @@ class Robot:
         before = int(self.wait(self.status)[kind])
         action()
         return self.wait(lambda: int(self.status()[kind]) >= before + at_least and self.status())
+
+    def set_parameter(self, name: str, value) -> SetParametersResult:
+        """Set a parameter of the detector, and return what it says to that."""
+        kind, attribute = KINDS[type(value)]
+        client = self.node.create_client(SetParameters, "/head_detector/set_parameters")
+        assert client.wait_for_service(WAIT_S)
+        request = SetParameters.Request(
+            parameters=[Parameter(name=name, value=ParameterValue(type=kind, **{attribute: value}))]
+        )
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(self.node, future, timeout_sec=WAIT_S)
+        self.node.destroy_client(client)
+        return future.result().results[0]
 
     def close(self) -> None:
         self.node.destroy_node()

@@ -1,6 +1,6 @@
 """What does a cascade find in rendered views that nothing was chosen on, and of which heads?
 
-    python bench/unseen.py FOLDER --seed 79 [--views 1500] [--cascade default] [--refine pose] [--clouds]
+    python bench/unseen.py FOLDER --seed 79 [--views 1500] [--cascade default] [--refine pose] [--clouds world]
 
 Looks at the depth images among the first views of a seed, and prints markdown tables: which share of the heads is found
 at so many false heads a frame; then, with the cascade's own threshold, by what is known of each head.
@@ -19,7 +19,7 @@ import numpy as np
 
 from headvox.config import DetectorConfig
 from headvox.data import F64
-from headvox.evolve.check import LEAST_SCORE, Outcome, scores_in
+from headvox.evolve.check import LEAST_SCORE, Outcome, points_of, scores_in
 from headvox.evolve.samples import RANGE_M, to_find
 from headvox.evolve.views import KINDS, View, keep_view
 from headvox.frames import inverse, transform
@@ -57,8 +57,8 @@ class Seen:
     nobody: Outcome
 
 
-def look(folder: Path, seed: int, views: int, detector: Detector, as_clouds: bool) -> Seen:
-    """Run ``detector`` over the depth images among the first ``views`` of ``seed``."""
+def look(folder: Path, seed: int, views: int, detector: Detector, clouds: str | None) -> Seen:
+    """Run ``detector`` over the depth images among the first ``views`` of ``seed``, or points in place of them."""
     heads: list[Head] = []
     false: list[F64] = []
     of_nobody: list[F64] = []
@@ -66,7 +66,8 @@ def look(folder: Path, seed: int, views: int, detector: Detector, as_clouds: boo
         if KINDS[number % len(KINDS)] in ("bodies", "shell"):
             continue  # clouds
         view = keep_view(folder, seed, number)
-        scores = scores_in(view, detector, as_clouds)
+        frame = view.frame if clouds is None else points_of(view.frame, in_world=clouds == "world")
+        scores = scores_in(view, detector, frame)
         if scores is None:
             continue
         wanted = np.flatnonzero(to_find(view)).tolist()
@@ -167,12 +168,12 @@ def main() -> None:
     parser.add_argument("--cascade", default="default")
     parser.add_argument("--refine", default="pose", choices=("pose", "sphere"))
     parser.add_argument(
-        "--clouds", action="store_true", help="points instead of images: nothing is known empty"
+        "--clouds", choices=("world", "camera"), help="points instead of images, in the frame of one of these"
     )
     args = parser.parse_args()
     config = DetectorConfig(cascade=args.cascade, max_range_m=RANGE_M, refine=args.refine)
     cascade = load_cascade(args.cascade)
-    least = cascade.min_score_occupied if args.clouds else cascade.min_score
+    least = cascade.min_score_occupied if args.clouds == "world" else cascade.min_score
     detector = Detector(replace(config, min_score=LEAST_SCORE))
     for line in tables(look(args.folder, args.seed, args.views, detector, args.clouds), least):
         print(line, flush=True)

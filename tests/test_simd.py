@@ -29,9 +29,11 @@ from headvox.machine.simd import (
     load_triples,
     lowest,
     mul,
+    ratio,
     resized,
     running_sums,
     seconds,
+    set_bits,
     shift_left,
     shift_right,
     shifted,
@@ -129,6 +131,16 @@ def first_of(bits):
     return lowest(bits)
 
 
+@bare_kernel
+def bits_of(bits):
+    return set_bits(bits)
+
+
+@bare_kernel
+def divided(a, b, out):
+    store(out, 0, ratio(load(a, 0), load(b, 0)))
+
+
 @pytest.mark.parametrize("dtype", [np.int16, np.uint16, np.int32, np.uint32])
 @pytest.mark.parametrize("at", [0, 1, 7])
 def test_equals_numpy(dtype, at):
@@ -207,6 +219,21 @@ def test_the_total_is_that_of_halves_of_halves():
     while len(halves) > 1:
         halves = halves[: len(halves) // 2] + halves[len(halves) // 2 :]
     assert summed(a, 3) == halves[0]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ratios_are_those_of_numpy(dtype):
+    a, b = np.random.default_rng(3).normal(size=(2, LANES)).astype(dtype)
+    a[:4], b[:4] = (1.0, -1.0, 0.0, np.nan), (0.0, 0.0, 0.0, 1.0)
+    out = np.empty(LANES, dtype)
+    divided(a, b, out)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        np.testing.assert_array_equal(out, a / b)
+
+
+@pytest.mark.parametrize("bits", [0, 1, 0x80000000, 0xFFFFFFFF, 0xDEADBEEF])
+def test_how_many_bits_are_set(bits):
+    assert bits_of(np.uint32(bits)) == bits.bit_count()
 
 
 def test_lowest_bit():

@@ -62,7 +62,8 @@ class Cloud:
 
     ``name`` is what errors call the sensor. ``points`` is (N, 3) float32 in metres, C-contiguous, invalid points NaN.
     ``T_world_sensor`` is (4, 4) float64, rigid, and places the sensor's frame in the world; ``None`` says that the
-    points are world coordinates already and that nobody knows where the sensor stood.
+    points are world coordinates already and that nobody knows where the sensor stood. With it, a cloud that a pinhole
+    camera's driver made of a depth image is looked at as that image: see :mod:`headvox.organise`.
     """
 
     name: str

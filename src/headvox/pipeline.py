@@ -32,6 +32,7 @@ from headvox.machine.turns import Turns
 from headvox.masks.compile import SCORE_UNIT, compile_cascade
 from headvox.masks.read import load_cascade
 from headvox.memory import Memory, Stages
+from headvox.organise import Organiser
 from headvox.placing import Placing
 from headvox.pose.fit import fit_poses
 from headvox.refine import fit_spheres
@@ -93,6 +94,7 @@ class Detector:
         """How many voxels of the last frame passed the gate."""
         self._alone = Turns(("This Detector is at work in another thread.", "Give each thread its own."))
         self._threads = Threads(self._config.threads)
+        self._organiser = Organiser(self._threads)
         self._placing = Placing(self._config)
         self._most_sensors = 0
         self._memory: Memory | None = None
@@ -209,7 +211,7 @@ class Detector:
     def _detect_together(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
         """Return the heads in up to :data:`BATCH` frames: at once on a GPU; without, or when it fails, one by one."""
         if self.on_device:
-            self.device = self.device or OnDevice(self._config, self.cascade)
+            self.device = self.device or OnDevice(self._config, self.cascade, self._organiser)
             try:
                 heads = self.device.detect(frames, expected, self.stage_ms)
                 self.candidates = self.device.candidates
@@ -227,9 +229,12 @@ class Detector:
     def _detect(self, frame: Frame, expected: Expected | None) -> Heads:
         """Return the heads in ``frame``, stage by stage, on the CPU."""
         check_frame(frame)
-        clock = Clock(self.stage_ms)
+        clock, given = Clock(self.stage_ms), frame
+        frame = self._organiser.organised(given)
         memory = self._memory_for(frame)
         occupied = self._voxelize(frame, memory)
+        if occupied[3] < 0:
+            raise nothing_in_range(given, memory.lattice.region)
         clock.done("voxelize")
         S = memory.volume_about(memory.candidates_about(occupied), self._threads.count)
         survivors = self._gate(S, occupied, memory, clock)
@@ -246,7 +251,7 @@ class Detector:
         return heads
 
     def _voxelize(self, frame: Frame, memory: Memory) -> I64:
-        """Enter every reading into the grid; return its lowest and highest occupied cell."""
+        """Enter every reading into the grid; return its lowest and highest occupied cell, below 0 if there is none."""
         lattice, boxes, counting = memory.lattice, memory.boxes, self.cascade.source.counting
         boxes[:] = NO_BOX
         memory.make_room_for_width(max((image.depth.shape[1] for image in frame.depths), default=0))
@@ -274,7 +279,6 @@ class Detector:
         memory.dirty = (max(int(occupied[0]), 0), int(occupied[3]) + 1)
         if occupied[3] < 0:
             memory.dirty = (0, 0)
-            raise nothing_in_range(frame, lattice.region)
         return occupied
 
     def _gate(self, S: npt.NDArray[Any], occupied: I64, memory: Memory, clock: Clock) -> I32:

@@ -17,6 +17,7 @@ from headvox.gate import gate_columns
 from headvox.machine.threads import Threads, begin
 from headvox.masks.compile import CompiledCascade, CompiledStages
 from headvox.masks.read import load_cascade
+from headvox.organise import Organiser
 from headvox.pipeline import Detector
 from headvox.pose.fit import FitMemory, fit_poses
 from headvox.pose.trials import search
@@ -65,6 +66,7 @@ def _search(config: DetectorConfig, voxel: float) -> None:
         detector.detect_frame(cloud)
         detector.detect_frame(image)
         detector.detect_frame(image, _expected())
+    Organiser(Threads(1)).organised(_camera_s_cloud())
     detector.close()
 
 
@@ -89,6 +91,13 @@ def _frames(voxel: float) -> Iterator[tuple[Frame, Frame]]:
         points.flags.writeable = wall.flags.writeable = writeable
         image = DepthImage("warm-up", wall, camera, np.eye(4))
         yield Frame(0, clouds=(Cloud("warm-up", points),)), Frame(0, depths=(image,))
+
+
+def _camera_s_cloud() -> Frame:
+    """Return a cloud that a depth camera may have made: of a wall, 1 m away."""
+    v, u = np.mgrid[:24, :32].astype(np.float32) / 20.0
+    points = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
+    return Frame(0, clouds=(Cloud("warm-up", points, np.eye(4)),))
 
 
 def _expected() -> Expected:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from headvox.data import F32, DepthImage
+from headvox.data import F32, Cloud, DepthImage
 
 SEED = 2
 SHELL_POINTS = 9000
@@ -20,10 +20,13 @@ SHELL_REACH_M = 0.155
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """What is measured on: the same room as two depth images and as a cloud (N, 3) in the world, and a head alone."""
+    """What is measured on: the same room as two depth images, as a cloud (N, 3) in the world and as the clouds of the
+    two cameras, each in its frame; and a head alone.
+    """
 
     images: tuple[DepthImage, ...]
     cloud: F32
+    clouds: tuple[Cloud, ...]
     shell: F32
     people: int
 
@@ -42,6 +45,14 @@ def make_input(small: bool = False) -> Input:
     scene = two_cameras(SEED, None, 0.1, postures, ("stay",) * len(postures), mode)
     frame, _ = scene.frame(0)
     points = [unproject(image.depth, image.intrinsics, image.T_world_camera) for image in frame.depths]
+    clouds = (
+        Cloud(
+            image.name,
+            unproject(image.depth, image.intrinsics, np.eye(4)).astype(np.float32),
+            image.T_world_camera,
+        )
+        for image in frame.depths
+    )
     body = scene.actors[0].body(scene.people, 0)
     T = body.T_world_head
     local = (body.vertices - T[:3, 3]) @ T[:3, :3]
@@ -53,6 +64,7 @@ def make_input(small: bool = False) -> Input:
     return Input(
         frame.depths,
         np.ascontiguousarray(np.concatenate(points), dtype=np.float32),
+        tuple(clouds),
         np.ascontiguousarray(shell[chosen]),
         len(postures),
     )

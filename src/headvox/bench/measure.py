@@ -18,7 +18,7 @@ from headvox.bench.input import SHELL_POINTS, Input, describe_machine, load_aver
 from headvox.bench.memory import watch_memory
 from headvox.bench.rounds import BURST, Case, percentiles, run_rounds
 from headvox.config import DetectorConfig
-from headvox.data import F32, F64, Heads
+from headvox.data import F32, F64, Frame, Heads
 from headvox.masks.compile import compile_cascade
 from headvox.masks.read import parse_cascade
 from headvox.pipeline import Detector
@@ -85,9 +85,15 @@ def measure(
         def detector(settings: DetectorConfig) -> Detector:
             return stack.enter_context(closing(Detector(settings)))
 
-        clouds, depth, depth_2, shell = (detector(settings) for settings in (config, config, two, alone))
+        clouds, cameras, depth, depth_2, shell = (
+            detector(settings) for settings in (config, config, config, two, alone)
+        )
         calls: dict[str, tuple[Detector, Callable[[], Heads]]] = {
             "detect, cloud": (clouds, lambda: clouds.detect(data.cloud)),
+            "detect_frame, clouds of 2 cameras": (
+                cameras,
+                lambda: cameras.detect_frame(Frame(0, clouds=data.clouds)),
+            ),
             "detect_depth": (depth, lambda: depth.detect_depth(data.images)),
             "detect_depth, 2 threads": (depth_2, lambda: depth_2.detect_depth(data.images)),
             f"detect, shell of {SHELL_POINTS}": (shell, lambda: shell.detect(data.shell)),

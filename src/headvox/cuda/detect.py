@@ -13,6 +13,7 @@ from headvox.data import Expected, Frame, Heads
 from headvox.keep import asks_cameras, least_before, least_score, slack_of
 from headvox.machine.clock import Clock
 from headvox.masks.compile import CompiledCascade
+from headvox.organise import Organiser
 from headvox.placing import Placing
 from headvox.relief import look_again
 from headvox.suppress import AROUND, MOST_PEAKS
@@ -26,14 +27,14 @@ DEVICE_STAGES = ("device", "host")
 class OnDevice:
     """What a detector does with frames on a GPU, by one cascade."""
 
-    def __init__(self, config: DetectorConfig, cascade: CompiledCascade) -> None:
+    def __init__(self, config: DetectorConfig, cascade: CompiledCascade, organiser: Organiser) -> None:
         self.config, self.cascade = config, cascade
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
         self.device: Device | None = None
         """What searches, once there was a frame."""
         self._sees = cascade.source.sees  # asks every tree: not for every frame
-        self._placing = Placing(config)
+        self._organiser, self._placing = organiser, Placing(config)
 
     def detect(
         self, frames: Sequence[Frame], expected: Sequence[Expected | None], stage_ms: dict[str, float]
@@ -47,10 +48,11 @@ class OnDevice:
         for frame in frames:
             check_frame(frame)
         clock = Clock(stage_ms)
-        asked = [self._asked(frame, one) for frame, one in zip(frames, expected, strict=True)]
+        organised = [self._organiser.organised(frame, slot) for slot, frame in enumerate(frames)]
+        asked = [self._asked(frame, one) for frame, one in zip(organised, expected, strict=True)]
         found = self._device_for(asked[0].lattice).search(asked, self._placing.rays)
         clock.done("device")
-        heads = [self._heads(*each) for each in zip(asked, found, strict=True)]
+        heads = [self._heads(*each) for each in zip(frames, asked, found, strict=True)]
         clock.done("host")
         return heads
 
@@ -68,11 +70,11 @@ class OnDevice:
             self.device = Device(self.cascade, lattice.shape, around, MOST_PEAKS, self.config.refine)
         return self.device
 
-    def _heads(self, asked: Asked, found: Found) -> Heads:
-        """Return the heads of a frame in which this was found."""
+    def _heads(self, frame: Frame, asked: Asked, found: Found) -> Heads:
+        """Return the heads of a ``frame`` in which this was found."""
         self.candidates = found.candidates
         if not found.occupied:
-            raise nothing_in_range(asked.frame, asked.lattice.region)
+            raise nothing_in_range(frame, asked.lattice.region)
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[found.yaws]
         centres, radii, scores, poses = found.centres, found.radii, found.scores, found.poses

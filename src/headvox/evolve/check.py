@@ -75,7 +75,7 @@ def look_at(views: Iterable[View], detector: Detector, as_clouds: bool = False) 
     false: list[F64] = []
     frames = 0
     for view in views:
-        scores = scores_in(view, detector, as_clouds)
+        scores = scores_in(view, detector, points_of(view.frame) if as_clouds else None)
         if scores is None:
             continue
         frames += 1
@@ -84,13 +84,14 @@ def look_at(views: Iterable[View], detector: Detector, as_clouds: bool = False) 
     return Outcome(np.concatenate([*heads, np.empty(0)]), np.concatenate([*false, np.empty(0)]), frames)
 
 
-def scores_in(view: View, detector: Detector, as_clouds: bool = False) -> tuple[F64, F64] | None:
+def scores_in(view: View, detector: Detector, frame: Frame | None = None) -> tuple[F64, F64] | None:
     """Return the scores of the heads to find in ``view``, -inf of a missed one, and of false heads.
 
-    They are (N,), in the order of the heads, and (M,); None: nothing is in range.
+    ``frame`` is looked at in place of the view's own. The scores are (N,), in the order of the heads, and (M,); None:
+    nothing is in range.
     """
     try:
-        found = detector.detect_frame(_points_of(view.frame) if as_clouds else view.frame)
+        found = detector.detect_frame(frame or view.frame)
     except HeadvoxError:
         return None
     counted = to_find(view)
@@ -101,12 +102,11 @@ def scores_in(view: View, detector: Detector, as_clouds: bool = False) -> tuple[
     return scores, found.scores[pairing.false]
 
 
-def _points_of(frame: Frame) -> Frame:
-    clouds = [
-        Cloud(
-            image.name,
-            unproject(image.depth, image.intrinsics, image.T_world_camera).astype(np.float32),
-        )
-        for image in frame.depths
-    ]
+def points_of(frame: Frame, in_world: bool = True) -> Frame:
+    """Return ``frame`` with points in place of its depth images, in the world's frame or in their cameras'."""
+    clouds = []
+    for image in frame.depths:
+        T = image.T_world_camera if in_world else np.eye(4)
+        points = unproject(image.depth, image.intrinsics, T).astype(np.float32)
+        clouds.append(Cloud(image.name, points, None if in_world else image.T_world_camera))
     return replace(frame, depths=(), clouds=(*frame.clouds, *clouds))

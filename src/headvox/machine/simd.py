@@ -142,6 +142,12 @@ def mul(typingctx, a, b):
 
 
 @intrinsic
+def ratio(typingctx, a, b):
+    """Return a / b, lane by lane, of floating-point numbers."""
+    return _two(a, b, None, lambda builder, x, y: builder.fdiv(x, y))
+
+
+@intrinsic
 def bit_and(typingctx, a, b):
     """Return a & b, lane by lane."""
     return _two(a, b, lambda builder, x, y: builder.and_(x, y))
@@ -406,6 +412,16 @@ def compress(typingctx, flat, at, bits, a):
         return place
 
     return types.int64(flat, at, types.uint32, a), emit
+
+
+@intrinsic
+def set_bits(typingctx, bits):
+    """Return how many of the ``bits`` of a uint32 are set."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.zext(builder.ctpop(arguments[0]), ir.IntType(64))
+
+    return types.int64(types.uint32), emit
 
 
 @intrinsic

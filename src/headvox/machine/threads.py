@@ -196,6 +196,10 @@ class Threads:
         self._awake = False
         self._start()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Say how to make others: those of a copy are its own."""
+        return Threads, (self.count,)
+
     def _start(self) -> None:
         self._process = os.getpid()
         self._shared = _Shared(self.count)

@@ -17,7 +17,9 @@ from headvox.check import as_stamp
 from headvox.config import TrackerConfig, given_or_default
 from headvox.data import F64, I64, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
+from headvox.machine.threads import Threads
 from headvox.machine.turns import Turns
+from headvox.organise import Organiser
 from headvox.tracking.identity import MOST_STRENGTH, come_back, note_sightings, pairs, price
 from headvox.tracking.kalman import (
     FIRST_RATE_RAD_S,
@@ -69,6 +71,7 @@ class Tracker:
         self.stamp_ns: int | None = None
         """Of the last frame that was tracked."""
         self._turns = Turns()
+        self._organiser = Organiser(Threads(1))
         self._last_id = 0
         self._roster = blank(0)
         self._set(given_or_default(config, TrackerConfig))
@@ -212,7 +215,8 @@ class Tracker:
         states = np.full(len(roster), OUT_OF_VIEW)
         missed = np.flatnonzero(~roster["lost"] & (roster["seen_ns"] != self._now()))
         if len(missed):
-            states[missed] = search(roster, missed, frame, config.sight_m, centres)
+            seen = self._organiser.organised(frame)
+            states[missed] = search(roster, missed, seen, config.sight_m, centres)
         age(roster, self._now(), dt, states, self._lasts_s, config.present_s, config.weak_s)
         self._confirm()
 

@@ -24,7 +24,8 @@ from headvox import (
 from headvox.frames import OPTICAL, inverse, transform, unproject
 from headvox.machine.simd import LANES
 from headvox.machine.threads import Threads
-from headvox.organise import BIAS, Organiser, grid_of, put_into_pixels
+from headvox.organise import Organiser, put_into_pixels
+from headvox.pixelgrid import BIAS, grid_of
 
 D435 = Intrinsics(848, 480, 430.25, 429.75, 423.6, 239.1)
 SMALL = Intrinsics(160, 90, 81.1, 81.3, 79.2, 44.9)

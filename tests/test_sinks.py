@@ -154,7 +154,7 @@ class Terminal(io.StringIO):
 
 def test_the_live_line_goes_away_for_notes_and_at_the_end() -> None:
     stream = Terminal()
-    live = Live(stream, None)
+    live = Live(stream)
     live.frame(Report(frames=3, bad=1, seconds=0.5))
     live.frame(Report(frames=4, bad=1, seconds=0.5))  # too soon after the first
     live.note("frame 2 skipped:\x07 torn")

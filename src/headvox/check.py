@@ -148,7 +148,8 @@ def nothing_in_range(frame: Frame, region: Region) -> HeadvoxError:
         return HeadvoxError(
             f"{cloud.name}: none of {len(cloud.points)} points is {where} and between {region.min_height_m:g} m and "
             f"{region.max_height_m:g} m high (nearest: {nearest:.2f} m from the origin of its frame).",
-            "Set centre, max_range_m, min_height_m or max_height_m, or give the sensor's transform.",
+            "Set centre, max_range_m, min_height_m or max_height_m, or give the sensor's transform (of files and "
+            "bags: --mount).",
         )
     if all(not image.depth.any() for image in frame.depths):
         return HeadvoxError(

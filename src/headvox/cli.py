@@ -187,15 +187,13 @@ def _convert(args: argparse.Namespace) -> int:
     from headvox.sources import open_source
     from headvox.sources.remote import fetched
 
-    notes: list[str] = []
     with (
         fetched(args.source) as path,
-        closing(open_source(path, source_options_of(args), notes.append)) as source,
+        closing(Live(sys.stderr)) as live,
+        closing(open_source(path, source_options_of(args), live.tell)) as source,
     ):
         keep_input(args.output, [path])
-        with closing(Live(sys.stderr, source.length)) as live, closing(Remarks(live.tell)) as remarks:
-            for note in notes:
-                live.tell(note)
+        with closing(Remarks(live.tell)) as remarks:
             done, bad = convert(source, args.output, lambda k: live.show(f"frame {k}"), remarks.skipped)
     size = f"{args.output.stat().st_size / 1e6:.1f} MB"
     print(

@@ -66,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
     if args.output is not None:
         keep_input(args.output, [args.source])
         check_file(args.output)
-    with closing(Live(sys.stderr, None)) as live:
+    with closing(Live(sys.stderr)) as live:
         with (
             fetched(args.source) as path,
             closing(open_source(path, source_options_of(args), live.note)) as source,

@@ -154,7 +154,7 @@ def either(names: Sequence[str]) -> str:
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each thing that a source may not tell by itself."""
-    group = parser.add_argument_group("bags, cameras and folders", "what they do not tell by themselves")
+    group = parser.add_argument_group("bags, cameras and clouds", "what they do not tell by themselves")
     group.add_argument(
         "--topic", action="append", default=[], metavar="NAME", help="read this topic (again for another)"
     )
@@ -164,7 +164,8 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
         nargs=6,
         type=number,
         metavar=("X", "Y", "Z", "ROLL", "PITCH", "YAW"),
-        help="where that frame, or the one sensor, stands: metres and degrees; PITCH above 0 looks down",
+        help="where that frame, or the one sensor, also of clouds in files, stands: metres and degrees; PITCH above 0 "
+        "looks down",
     )
     group.add_argument(
         "--extrinsics",

@@ -14,12 +14,16 @@ EVERY_S = 0.05  # nobody reads faster, and a slow terminal must not slow the loo
 class Live:
     """Notes for a person, and below them a line that is written anew; without a terminal only the notes."""
 
-    def __init__(self, stream: TextIO, length: int | None) -> None:
+    def __init__(self, stream: TextIO, length: int | None = None) -> None:
         self._stream = stream
-        self._of = "" if length is None else f"/{length}"
+        self.expect(length)
         self._watched = stream.isatty()
         self._shown = 0
         self._next = 0.0
+
+    def expect(self, length: int | None) -> None:
+        """Say of how many frames a run will be; None: nobody knows."""
+        self._of = "" if length is None else f"/{length}"
 
     def note(self, text: str) -> None:
         """Write a line that stays."""

@@ -138,7 +138,7 @@ def _run_batch(args: argparse.Namespace) -> int:
     for source in places:  # true heads are called heads.jsonl: results of that name would be taken for them
         keep_input(settings.target(source), inputs)
     rows = []
-    with closing(Live(sys.stderr, None)) as live:
+    with closing(Live(sys.stderr)) as live:
 
         def tell(done: Done) -> None:
             counts = ["-" if n is None else str(n) for n in (done.frames, done.heads, done.bad)]

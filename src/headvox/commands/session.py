@@ -82,13 +82,11 @@ def opened(args: argparse.Namespace, track: bool = True) -> Iterator[Session]:
     config, tracker_config = config_of(args), tracker_config_of(args)
     with ExitStack() as stack:
         path = stack.enter_context(fetched(args.source)) if args.source else sample_folder()
-        notes: list[str] = []
-        source = stack.enter_context(closing(open_source(path, source_options_of(args), notes.append)))
-        live = stack.enter_context(closing(Live(sys.stderr, source.length)))
+        live = stack.enter_context(closing(Live(sys.stderr)))
         if args.source is None:
             live.note(f"no SOURCE given: running the sample that ships with headvox, {path}")
-        for note in notes:
-            live.tell(note)
+        source = stack.enter_context(closing(open_source(path, source_options_of(args), live.tell)))
+        live.expect(source.length)
         detector = stack.enter_context(closing(Detector(config, note=live.tell)))
         tracker = Tracker(tracker_config) if track else None
         inputs = (path, args.config, args.extrinsics, config.cascade)

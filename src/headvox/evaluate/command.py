@@ -101,7 +101,7 @@ def _report(args: argparse.Namespace) -> int:
         make_folder(args.output)
     scores: list[Scores] = []
     recorded: dict[str, list[Outcome]] = {}
-    with closing(Live(sys.stderr, None)) as live:
+    with closing(Live(sys.stderr)) as live:
         if args.output is not None and not plan.pictures:
             live.tell(f"without matplotlib there will be {REPORT} alone: pip install 'headvox[plot]'")
         scenarios = _scenarios(args, live)

@@ -19,6 +19,7 @@ from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
 
 if TYPE_CHECKING:
+    from headvox.sources.mounting import Mounting
     from headvox.sources.options import SourceOptions
 
 
@@ -52,9 +53,10 @@ def open_source(
 
     Args:
         path: of a file or a folder, or ``realsense:``.
-        options: what a bag or a camera does not tell by itself; a depth recording takes ``extrinsics``, a
-            folder of clouds ``rate_hz``, others none.
-        say: told what is assumed about a bag, or overruled in a recording, a line each; by default these are warnings.
+        options: what a bag or a camera does not tell by itself; a depth recording takes ``extrinsics``, clouds in
+            files ``T_world_mount``, and a folder of them ``rate_hz``.
+        say: told what is assumed about a bag or a cloud, or overruled in a recording, a line each; by default these
+            are warnings.
 
     Returns:
         A source: it yields each :class:`~headvox.data.Frame` once, in time order, and a
@@ -86,14 +88,21 @@ def open_source(
             return _open_recording(place if place.is_dir() else place.parent, options, say or _warn)
         if place.is_dir():
             options = options or SourceOptions()
-            check_unused(replace(options, rate_hz=None), place.name)
-            return FolderSource(place, options.rate_hz)
-        check_unused(options, place.name)
+            check_unused(replace(options, rate_hz=None, T_world_mount=None), place.name)
+            return FolderSource(place, options.rate_hz, _mounting(options, say or _warn))
+        options = options or SourceOptions()
+        check_unused(replace(options, T_world_mount=None), place.name)
     except OSError as error:
         raise HeadvoxError(f"{place}: cannot be read: {error.strerror}.", "Check the path.") from None
     except ValueError as error:  # a NUL in the path
         raise HeadvoxError(f"{place}: cannot be read: {error}.", "Check the path.") from None
-    return CloudFileSource(place)
+    return CloudFileSource(place, _mounting(options, say or _warn))
+
+
+def _mounting(options: SourceOptions, say: Callable[[str], None]) -> Mounting:
+    from headvox.sources.mounting import Mounting
+
+    return Mounting(options.T_world_mount, say)
 
 
 def _open_recording(folder: Path, options: SourceOptions | None, say: Callable[[str], None]) -> Source:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from headvox.data import Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.sources.check import check_cloud
 from headvox.sources.content import CloudFile
+
+if TYPE_CHECKING:
+    from headvox.sources.mounting import Mounting
 
 MAX_FILE_BYTES = 4 << 30
 PNG = b"\x89PNG"
@@ -23,28 +27,30 @@ class CloudFileSource:
 
     length: int | None = 1
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, mounting: Mounting | None = None) -> None:
         """Raise HeadvoxError where the file is missing or no known point-cloud file; it is read later."""
         self.name = path.name
         self.path = path
+        self.mounting = mounting
         _reader(_head(path), path.name)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the one frame, or raise HeadvoxError when the file cannot be used."""
-        yield Frame(0, clouds=(read_cloud(self.path),))
+        yield Frame(0, clouds=(read_cloud(self.path, self.mounting),))
 
     def close(self) -> None:
         """Do nothing: the file is open only while it is read."""
 
 
-def read_cloud(path: Path) -> Cloud:
-    """Read one file as a cloud with points in it.
+def read_cloud(path: Path, mounting: Mounting | None = None) -> Cloud:
+    """Read one file as a cloud with points in it, placed by ``mounting``.
 
     Raises:
         HeadvoxError: the file is missing, damaged or of unknown kind, or check_cloud refuses its points.
     """
-    cloud = read_cloud_file(path)
-    return Cloud(path.name, cloud.points, cloud.T_world_sensor)
+    file = read_cloud_file(path)
+    cloud = Cloud(path.name, file.points, file.T_world_sensor)
+    return cloud if mounting is None else mounting.placed(cloud)
 
 
 def read_cloud_file(path: Path) -> CloudFile:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from headvox.data import F64, BadFrame, Frame
+from headvox.data import F64, BadFrame, Cloud, Frame
 from headvox.errors import HeadvoxError
 from headvox.frames import is_moving, transform, unproject
 from headvox.sources import Source, open_source
@@ -18,6 +18,7 @@ from headvox.sources.bag import BagSource
 from headvox.sources.cloudfile import CloudFileSource, read_cloud_file
 from headvox.sources.content import CloudFile
 from headvox.sources.folder import FolderSource
+from headvox.sources.mounting import Mounting
 from headvox.sources.options import SourceOptions, listed
 from headvox.sources.realsense import RealSenseFile
 from headvox.sources.recording import Camera, RecordedFrame, RecordingSource
@@ -48,7 +49,10 @@ def describe(
         case FolderSource():
             rows = _folder_rows(source)
         case CloudFileSource():
-            rows = [("frames", "1"), *_file_rows(read_cloud_file(source.path))]
+            rows = [
+                ("frames", "1"),
+                *_file_rows(source.path.name, read_cloud_file(source.path), source.mounting),
+            ]
         case BagSource():
             rows = _bag_rows(source)
         case RealSenseFile():
@@ -59,7 +63,7 @@ def describe(
     return [(_printable(what), _printable(value)) for what, value in [("name", source.name), *rows]]
 
 
-def _file_rows(cloud: CloudFile) -> Rows:
+def _file_rows(name: str, cloud: CloudFile, mounting: Mounting | None) -> Rows:
     finite = cloud.points[np.isfinite(cloud.points[:, 0])].astype(np.float64)
     rows = [("kind", cloud.format), ("points", f"{len(cloud.points)}")]
     if cloud.faces:
@@ -68,11 +72,15 @@ def _file_rows(cloud: CloudFile) -> Rows:
             ("faces", f"{cloud.faces}: {cloud.vertices} vertices and {sampled} samples of the surface")
         )
     rows.append(("finite", f"{len(finite) / len(cloud.points):.1%}"))
-    if cloud.T_world_sensor is None:
+    placed = Cloud(name, cloud.points, cloud.T_world_sensor)
+    T = (mounting.placed(placed) if mounting else placed).T_world_sensor
+    if T is None:
         rows.append(("box", _box(finite)))
     else:
-        rows.append(("box", _box(transform(cloud.T_world_sensor, finite)) + ", world frame"))
-        rows.append(("sensor", f"{_where(cloud.T_world_sensor)} by its VIEWPOINT"))
+        told = [] if cloud.T_world_sensor is None else ["its VIEWPOINT"]
+        told += ["--mount"] if mounting and mounting.T_world_mount is not None else []
+        rows.append(("box", _box(transform(T, finite)) + ", world frame"))
+        rows.append(("sensor", f"{_where(T)} by {' and '.join(told)}"))
     rows.append(("other fields", ", ".join(cloud.extra) or "none"))
     return rows
 
@@ -86,7 +94,7 @@ def _folder_rows(source: FolderSource) -> Rows:
         ("duration", f"{seconds:.2f} s, files have no stamps and {apart}"),
     ]
     path, cloud = _first_readable(source.paths)
-    return [*rows, ("described file", path.name), *_file_rows(cloud)]
+    return [*rows, ("described file", path.name), *_file_rows(path.name, cloud, source.mounting)]
 
 
 def _bag_rows(source: BagSource) -> Rows:

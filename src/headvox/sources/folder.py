@@ -5,10 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
 from headvox.sources.cloudfile import OF_DEPTH, SUFFIXES, read_cloud
+
+if TYPE_CHECKING:
+    from headvox.sources.mounting import Mounting
 
 FRAME_NS = 33_333_333  # files have no stamps: unless somebody says, they are taken to be 30 a second
 RATES_HZ = 0.001, 10_000.0  # what a rate may be
@@ -23,7 +27,7 @@ class FolderSource:
 
     length: int | None
 
-    def __init__(self, folder: Path, rate_hz: float | None = None) -> None:
+    def __init__(self, folder: Path, rate_hz: float | None = None, mounting: Mounting | None = None) -> None:
         """Raise HeadvoxError where the folder cannot be read or has no point-cloud file, or of a rate that is none."""
         if rate_hz is not None and not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
             raise HeadvoxError(
@@ -35,6 +39,7 @@ class FolderSource:
         self.length = len(self.paths)
         self.rate_hz = rate_hz
         """As it was given; None: it is assumed."""
+        self.mounting = mounting
         self._open = True
 
     def __iter__(self) -> Iterator[Frame | BadFrame]:
@@ -44,7 +49,7 @@ class FolderSource:
                 return
             stamp_ns = self.stamp_ns(index)
             try:
-                frame = Frame(stamp_ns, clouds=(read_cloud(path),))
+                frame = Frame(stamp_ns, clouds=(read_cloud(path, self.mounting),))
             except HeadvoxError as error:
                 yield BadFrame(stamp_ns, str(error))
             else:

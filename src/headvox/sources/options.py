@@ -50,8 +50,8 @@ def check_unused(options: SourceOptions | None, name: str) -> None:
         or options.rate_hz is not None
     ):
         raise HeadvoxError(
-            f"{name}: --topic, --frame and --mount are for bags and live cameras, --extrinsics for recordings "
-            "and live cameras, --rate for folders of clouds only.",
+            f"{name}: --topic and --frame are for bags and live cameras, --mount for these and for files of clouds, "
+            "--extrinsics for recordings and live cameras, --rate for folders of clouds only.",
             "Leave them out.",
         )
 

@@ -16,12 +16,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 
 from headvox.config import DetectorConfig
-from headvox.data import F64, DepthImage, Frame
+from headvox.data import F32, F64, DepthImage, Frame
 from headvox.errors import HeadvoxError
 from headvox.evaluate.match import Rules, match
 from headvox.evaluate.truth import FILE, TrueHeads, read_truth
@@ -30,7 +29,6 @@ from headvox.pipeline import Detector
 from headvox.sources import open_source
 
 Rng = np.random.Generator
-F32 = npt.NDArray[np.float32]
 Way = Callable[[DepthImage, TrueHeads, Rng], tuple[DepthImage, TrueHeads]]
 
 LEAST = -10.0  # a score that nearly every head has, found or not

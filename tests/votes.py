@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from headvox.data import I32, I64
 from headvox.integral import Integral, box_reach, with_margins
 from headvox.masks.compile import CompiledVotes
 from headvox.slabs import ONE_SLAB
-from headvox.vote import I32, I64, vote_masks
+from headvox.vote import vote_masks
 
 
 def score_by_votes(S: Integral, cells: I32, votes: CompiledVotes) -> tuple[I64, I32]:

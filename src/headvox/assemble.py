@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from headvox.data import F64, Heads, unknown
+from headvox.data import F64, I64, Heads, unknown
 from headvox.masks.compile import SCORE_UNIT
 from headvox.pose.fit import Poses
 from headvox.refine import HAIR_M
 from headvox.suppress import suppress_overlaps
-
-I64 = npt.NDArray[np.int64]
 
 SAME_HEAD_M = 0.18
 MOST_POSES = 32
@@ -35,7 +32,7 @@ def best_apart(centres: F64, scores: I64, spheres: F64 | None, haired: bool) -> 
     return kept, centres[kept], radii[kept]
 
 
-def stated(centres: F64, radii: F64, scores: I64, least: int, yaws: F64 | None) -> Heads:
+def as_heads(centres: F64, radii: F64, scores: I64, least: int, yaws: F64 | None) -> Heads:
     """Return heads with these ``centres`` (N, 3) and ``radii`` (N,), metres, world, best score first.
 
     ``scores`` (N,) are in steps; heads that score ``least`` are sure. ``yaws`` (N,) are in radians, if known.

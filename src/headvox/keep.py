@@ -9,11 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.config import DetectorConfig
-from headvox.data import F64, Expected, Frame
+from headvox.data import F64, I64, Expected, Frame
 from headvox.masks.cascade import Cascade
 from headvox.masks.compile import SCORE_UNIT, CompiledRelief
-
-I64 = npt.NDArray[np.int64]
 
 
 class Judged(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.assemble import MOST_POSES
-from headvox.data import F64
+from headvox.data import F64, I32, I64
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
 from headvox.integral import box_reach, room_for, row_for, shape_with_margins
 from headvox.machine.simd import LANES
@@ -21,9 +21,6 @@ from headvox.slabs import Slabs, cut
 from headvox.visibility import as_columns, cells_of
 from headvox.vote import StageTables, seen_boxes
 from headvox.voxelize import Lattice, Marking
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 
 
 class Memory:

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.assemble import MOST_POSES, best_apart, stated, with_poses
+from headvox.assemble import MOST_POSES, as_heads, best_apart, with_poses
 from headvox.check import check_frame, knows_an_origin, nothing_in_range
 from headvox.config import DetectorConfig, given_or_default
 from headvox.cuda.detect import DEVICE_STAGES, OnDevice
 from headvox.cuda.device import BATCH, DeviceLost, use_device
-from headvox.data import F64, Cloud, DepthImage, Expected, Frame, Heads
+from headvox.data import F64, I32, I64, Cloud, DepthImage, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
@@ -43,9 +43,6 @@ from headvox.verify import verify
 from headvox.visibility import count_states, look_about
 from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import NO_BOX, empty, join_boxes, mark_depth, mark_points
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 
 Loop = tuple[Callable[..., None], tuple[Any, ...]]
 
@@ -428,7 +425,7 @@ class Detector:
             kept, centres, radii = kept[again], centres[again], radii[again]
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks[kept]]]
-        heads = stated(centres, radii, scores, least, yaws)
+        heads = as_heads(centres, radii, scores, least, yaws)
         if self._config.refine != "pose":
             return heads
         poses = fit_poses(frame, heads.centres[:MOST_POSES], memory.fits, self._threads, expected)

@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from headvox.data import F64, DepthImage, Expected
+from headvox.data import F64, I16, I64, DepthImage, Expected
 from headvox.keep import keep
 from headvox.machine.kernels import bare_kernel, kernel, read_only
 from headvox.machine.simd import LANES
@@ -21,9 +20,6 @@ from headvox.masks.cascade import MEASURES, SIDES
 from headvox.masks.compile import CompiledRelief
 from headvox.visibility import NEAREST_M, read_pixels, world_to_pixels
 from headvox.vote import order
-
-I16 = npt.NDArray[np.int16]
-I64 = npt.NDArray[np.int64]
 
 FARTHEST = 600  # mm: farther from the centre, either way, is as far
 UNKNOWN = 601  # no return, or out of view

@@ -11,11 +11,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from headvox.data import I64
 from headvox.machine.kernels import rule
-
-I64 = npt.NDArray[np.int64]
 
 
 class Slab(NamedTuple):

@@ -7,14 +7,11 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64
+from headvox.data import F64, I32, I64
 from headvox.machine.kernels import kernel
 
-I32 = npt.NDArray[np.int32]
 PEAK_REACH = {1: 1, 2: 1, 4: 2}
 """How far the neighbours of a voxel are when every voxel, every other, every fourth is a candidate."""
-
-I64 = npt.NDArray[np.int64]
 
 MOST_PEAKS = 256
 """Peaks of a frame that are looked at closer: a frame of noise must not take forever."""

@@ -7,15 +7,12 @@ each unit of misfit and each metre that the radius is off cost a part of the sco
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from headvox.data import Expected, Heads
+from headvox.data import I64, Expected, Heads
 from headvox.keep import is_expected, keep
 from headvox.masks.cascade import Verification
 from headvox.masks.compile import SCORE_UNIT
 from headvox.pose.fit import Poses
-
-I64 = npt.NDArray[np.int64]
 
 
 def losses_of(poses: Poses, rule: Verification) -> I64:

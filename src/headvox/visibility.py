@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F32, F64, DepthImage, Intrinsics
+from headvox.data import F32, F64, I32, DepthImage, Intrinsics
 from headvox.frames import inverse
 from headvox.machine.kernels import bare_kernel, kernel, product, read_only, rule
 from headvox.voxelize import Lattice
@@ -27,8 +27,6 @@ OUT_OF_VIEW, NO_RETURN, BEHIND, SURFACE, SEEN_EMPTY = range(5)
 HEAD_M = 0.07  # how far from its centre a head is sampled: well inside of its outline
 IN_FRONT_M = 0.25  # the head's own face is some 10 cm nearer than its centre
 BEYOND_M = 0.15
-
-I32 = npt.NDArray[np.int32]
 
 
 @rule

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from headvox.data import I32, I64
 from headvox.integral import Integral, box_reach, place, set_corners, with_margins
 from headvox.machine.kernels import bare_kernel, kernel, product, rule
 from headvox.machine.simd import LANES, add, choose, fill, larger, load, smaller, store, sub
@@ -25,10 +26,6 @@ from headvox.slabs import ONE_SLAB, slice_of
 
 DROPPED = -(1 << 40)
 FEATURES_PER_GROUP = len(STATISTICS)
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
-F64 = npt.NDArray[np.float64]
 
 
 @rule

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from headvox.assemble import stated, with_poses
+from headvox.assemble import as_heads, with_poses
 from headvox.check import check_frame, nothing_in_range
 from headvox.config import DetectorConfig
 from headvox.cuda.device import Device
@@ -85,7 +85,7 @@ class OnDevice:
             kept, scores = look_again(centres, radii, scores, asked.frame.depths, relief, least, *common)
             centres, radii, yaws = centres[kept], radii[kept], None if yaws is None else yaws[kept]
             poses = None if poses is None else poses.of(kept, centres)
-        heads = stated(centres, radii, scores, least, yaws)
+        heads = as_heads(centres, radii, scores, least, yaws)
         if poses is None:
             return heads
         if rule is not None:

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.check import origins_of
-from headvox.data import F64, DepthImage, Expected, Frame
+from headvox.data import F64, I32, I64, DepthImage, Expected, Frame
 from headvox.pose.fit import Poses
 from headvox.pose.nearby import lens_of
 from headvox.visibility import camera_table
@@ -48,9 +48,6 @@ KIND, DATA, WIDTH, HEIGHT, COLUMN, ROW, KNOWS, TRANSFORM, TABLE, PLACE, LENS = (
 SENSOR = 76
 OCTET = 16  # words of an expected head
 NOTHING, CLOUD, DEPTH = 0, 1, 2
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.config import DetectorConfig
-from headvox.data import F64, Expected, Frame
+from headvox.data import F64, I32, I64, Expected, Frame
 from headvox.errors import HeadvoxError
 from headvox.evolve import boost, samples
 from headvox.evolve.samples import Grid, Samples, join, to_find
@@ -35,10 +35,6 @@ LEAST_SCORE = -6.0
 NEAR_M, APART_M = 0.15, 0.25
 PLAN = boost.Plan("again", "seen", 0, 60, 0.10, 0.0)
 LEAVES, LEAST_ROWS, SHARE_OF_FEATURES = 2, 100, 0.3
-
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

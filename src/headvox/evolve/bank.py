@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from headvox.data import I16, I32
 from headvox.integral import Integral, sum_about
 from headvox.machine.kernels import kernel
 from headvox.masks.cascade import CHANNELS, STATISTICS, Box, Group, ring, statistics
 from headvox.masks.compile import voxel_box
 
 VOXEL_M, SUBDIVISION = 0.05, 2
-
-I16 = npt.NDArray[np.int16]
-I32 = npt.NDArray[np.int32]
 
 
 def cube(edge: float) -> tuple[float, float, float]:

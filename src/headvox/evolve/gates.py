@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64
+from headvox.data import F64, I64
 from headvox.evolve.bank import GATE
-from headvox.evolve.samples import I64, GateSums
+from headvox.evolve.samples import GateSums
 from headvox.masks.cascade import Condition
 
 LOST_COST = 30.0

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64, Frame
+from headvox.data import F64, I16, I32, I64, Frame
 from headvox.evolve.bank import GATE, OCCUPIED, SEEN, SUBDIVISION, VOXEL_M, sums_about
 from headvox.evolve.views import View
 from headvox.fuse import Region
@@ -37,9 +37,6 @@ AROUND = np.array(list(product((-1, 0, 1), repeat=3)), np.int32)
 HARD, EASY = 150, 50  # negatives of a view, at most
 MOST_PEAKS, FEW_AROUND = 24, 5
 
-I16 = npt.NDArray[np.int16]
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 Rng = np.random.Generator
 
 

@@ -17,14 +17,12 @@ from typing import Any, NamedTuple
 from weakref import finalize
 
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 
+from headvox.data import I64
 from headvox.machine.kernels import bare_kernel
 from headvox.machine.simd import intrinsic
-
-I64 = npt.NDArray[np.int64]
 
 LINE = 8  # what different threads write is a cache line apart
 BEGUN, RESTED = 0, LINE  # flags: the turn that goes on, the last one that sent the threads to sleep,

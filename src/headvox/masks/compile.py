@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from headvox.data import I32, I64
 from headvox.errors import HeadvoxError
 from headvox.masks.cascade import (
     CHANNELS,
@@ -29,9 +30,6 @@ from headvox.masks.cascade import (
     statistics,
     turned,
 )
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 
 SCORE_UNIT = 1024
 FARTHEST_M = 1000.0  # cuts of the last look: nothing that it asks reaches as far, and millimetres fit 32 bits

@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from headvox.errors import HeadvoxError, MissingExtra
-from headvox.ros.outputs import NS, Content
+from headvox.ros.outputs import Content
+from headvox.ros.synchronise import NS
 from headvox.writable import check_file
 
 # A builtin_interfaces/Time has 32 bits of seconds, with sign; an MCAP has no time before 1970.

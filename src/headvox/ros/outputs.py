@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from headvox.data import F64, Heads, State, Tracks
+from headvox.ros.synchronise import NS
 
 Content = dict[str, Any]
 """The fields of a message that are not zero, by name; messages within are contents, too."""
 
-NS = 1_000_000_000
 SPHERE, CUBE, ARROW, TEXT = 2, 1, 0, 9  # visualization_msgs/Marker
 ADD, DELETE = 0, 2
 GREY = (0.7, 0.7, 0.7)

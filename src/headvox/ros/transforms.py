@@ -19,8 +19,8 @@ import numpy as np
 from headvox.data import F64
 from headvox.errors import HeadvoxError
 from headvox.frames import inverse, placed
+from headvox.ros.synchronise import NS
 
-NS = 1_000_000_000
 UNIT_TOLERANCE = 0.01  # how far a quaternion's length may be from 1: as tf2
 STOPPED_NS = NS  # a transform that is older than this is not late, it has stopped
 LOOK_UP_EVERY_S = 0.05  # while waiting, for whoever wants us to stop

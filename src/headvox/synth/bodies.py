@@ -13,9 +13,8 @@ from importlib.resources import files
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64
+from headvox.data import F64, I32
 
-I32 = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 
 AGE_YEARS = (1.0, 10.0, 25.0, 90.0)  # the ages of the four anchor bodies

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from headvox.data import F64
-from headvox.synth.bodies import I32, RestBody, load_basis
+from headvox.data import F64, I32
+from headvox.synth.bodies import RestBody, load_basis
 from headvox.synth.clothes import clothe
 from headvox.synth.headwear import (
     backpack_piece,

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from headvox.data import F32, F64
-from headvox.synth.rays import I32, ROOM_ID, Mesh, join
+from headvox.data import F32, F64, I32
+from headvox.synth.rays import ROOM_ID, Mesh, join
 from headvox.synth.solids import Rng, Solid, box, cylinder, ellipsoid, lathe, lump
 
 

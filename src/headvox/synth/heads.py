@@ -21,11 +21,10 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 from scipy.stats import qmc
 
-from headvox.data import F64, Intrinsics
+from headvox.data import F64, I32, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.parallel.workers import ALONE, Workers
 from headvox.synth.bodies import (
-    I32,
     Mask,
     blend_points,
     load_basis,

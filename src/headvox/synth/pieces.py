@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from headvox.data import F64
-from headvox.synth.bodies import I32, RestBody, load_basis
+from headvox.data import F64, I32
+from headvox.synth.bodies import RestBody, load_basis
 
 N_AZIMUTH = 32
 N_ROWS = 10

@@ -11,13 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from headvox.data import F32, F64, Intrinsics
+from headvox.data import F32, F64, I32, Intrinsics
 from headvox.frames import inverse, transform
 from headvox.machine.kernels import kernel
-
-I32 = npt.NDArray[np.int32]
 
 NEAR_M = 0.02
 NOTHING = -1

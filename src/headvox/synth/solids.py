@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from headvox.data import F64
-from headvox.synth.rays import I32
+from headvox.data import F64, I32
 
 Rng = np.random.Generator
 Solid = tuple[F64, I32]

@@ -8,11 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from headvox.data import F64, I64
+from headvox.data import F64, I32, I64
 from headvox.errors import HeadvoxError
 from headvox.machine.kernels import kernel
 
-I32 = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 
 TRIES_PER_POINT = 5

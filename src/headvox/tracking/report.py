@@ -27,7 +27,7 @@ def report(roster: Roster, last_ns: int, stamp_ns: int) -> Tracks:
     ``last_ns`` is the stamp of the last frame, ``stamp_ns`` the moment to which ``roster`` was predicted.
     """
     order = np.empty(len(roster), np.int64)
-    order = order[: stated(roster, last_ns, order)]
+    order = order[: list_stated(roster, last_ns, order)]
     n = len(order)
     tracks = Tracks(
         stamp_ns, np.empty(n, np.int64), np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3)),
@@ -69,7 +69,7 @@ def tentative(heads: Heads, stamp_ns: int) -> Tracks:
 
 
 @kernel
-def stated(roster, last_ns, order):
+def list_stated(roster, last_ns, order):
     """Write to ``order`` (N,) which rows are stated: by id, then those without one. Return how many."""
     count = 0
     for n in range(roster.shape[0]):

@@ -196,6 +196,25 @@ def test_points_in_the_world_need_no_sensor(tmp_path):
     assert notes == []
 
 
+@pytest.mark.parametrize("is_ros1", [False, True])
+def test_distortion_is_told_once(tmp_path, is_ros1):
+    maker = Maker(is_ros1)
+    info = maker.info(START, "cam_optical", CAMERA)
+    (info.D if is_ros1 else info.d)[:2] = -0.3, 0.1
+    (info.P if is_ros1 else info.p)[:] = 0.0
+    world = [("/tf_static", START, maker.transform(0, "world", "cam_optical", LEFT @ OPTICAL))]
+    for name, told in (("image_raw", 1), ("image_rect", 0)):
+        images = [
+            (f"/cam/depth/{name}", START + k, maker.depth(START + k, "cam_optical", depth_of(k)))
+            for k in range(3)
+        ]
+        messages = [*world, ("/cam/depth/camera_info", START, info), *images]
+        source, notes = opened(write_bag(tmp_path, "ros1" if is_ros1 else "mcap", messages, name))
+        assert all(frame.depths[0].intrinsics == CAMERA for frame in source)
+        assert len(notes) == told
+        assert all("/cam/depth/image_raw: its camera_info has distortion" in note for note in notes)
+
+
 def test_the_stamps_of_the_recorder_stand_in_for_none(tmp_path):
     maker = Maker()
     messages = [("/fused", START + k * STEP, maker.cloud(0, "map", POINTS)) for k in range(3)]

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from headvox import HeadvoxError
-from headvox.ros.messages import FIELD_TYPES, cloud_points, depth_image, intrinsics, stamp_ns
+from headvox.ros.messages import (
+    FIELD_TYPES,
+    cloud_points,
+    depth_image,
+    distortion_remark,
+    intrinsics,
+    stamp_ns,
+)
 
 SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8}
 CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
@@ -263,6 +270,27 @@ def test_a_camera_info_without_a_calibration_is_refused(changes, what):
     with pytest.raises(HeadvoxError) as refused:
         intrinsics(info(**changes))
     assert what in refused.value.what
+
+
+@pytest.mark.parametrize(
+    ("d", "topic", "is_told"),
+    [
+        ([-0.3, 0.1, 0.0, 0.0, 0.0], "/left/depth/image_raw", True),
+        ([-0.3, 0.1, 0.0, 0.0, 0.0], "/direct/unrectified/image", True),
+        ([-0.3, 0.1, 0.0, 0.0, 0.0], "/left/depth/image_rect_raw", False),
+        ([-0.3, 0.1, 0.0, 0.0, 0.0], "/left/rectified/depth", False),
+        ([0.0] * 5, "/left/depth/image_raw", False),
+        ([], "/left/depth/image_raw", False),
+        (np.zeros(8), "/left/depth/image_raw", False),
+        (np.array([0, 0, 0, 0, 1e-3, 0, 0, 0]), "/left/depth/image_raw", True),
+    ],
+)
+def test_distortion_is_told_of_what_may_not_be_rectified(d, topic, is_told):
+    remark = distortion_remark(info(d=d, distortion_model="plumb_bob"), topic)
+    assert bool(remark) == is_told
+    if is_told:
+        assert remark.startswith(f"{topic}: its camera_info has distortion ('plumb_bob')")
+        assert "rectify it" in remark
 
 
 def test_stamps_keep_every_nanosecond():

@@ -100,6 +100,14 @@ def test_truncated_bodies_are_refused(encoding):
         read_pcd(pcd(MANY, encoding)[:-12], "a.pcd")
 
 
+def test_a_column_that_the_header_does_not_name_is_refused():
+    lines = pcd(MANY, "ascii").split(b"\n")
+    body = lines.index(b"DATA ascii") + 1
+    wider = b"\n".join([*lines[:body], *(line + b" 0.5" if line.strip() else line for line in lines[body:])])
+    with pytest.raises(HeadvoxError, match="the header promises 1400 numbers, the body has 1600"):
+        read_pcd(wider, "a.pcd")
+
+
 def test_a_body_that_unpacks_to_gigabytes_is_refused():
     data = pcd(MANY, "binary_compressed").replace(b"WIDTH 200", b"WIDTH 100000000")
     data = data.replace(b"POINTS 200", b"POINTS 100000000")

@@ -92,6 +92,10 @@ XYZ = b"property float x\nproperty float y\nproperty float z\n"
         (HEAD % b"2" + XYZ + b"end_header\n" + bytes(23), "promises 2 rows of 'vertex', the file has less"),
         (HEAD % b"999999999999" + XYZ + b"end_header\n" + bytes(2000), "promises 999999999999 rows"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\n" + XYZ + b"end_header\n1 2 three\n", "not a number"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 2\n" + XYZ + b"end_header\n1 2 3 .5\n4 5 6 .5\n",
+            "promises 6 numb",
+        ),
         (ply(SQUARE, faces=[(0, 1, 9)]), "names vertex 9, expected 0 to 4"),
         (ply(SQUARE, faces=[(0, 1, -2)]), "names vertex -2, expected 0 to 4"),
         (ply(SQUARE, "ascii", faces=POLYGONS)[:-6], "promises 3 rows of 'face'"),

@@ -16,7 +16,7 @@ from headvox.data import Cloud, DepthImage, Frame
 from headvox.errors import HeadvoxError
 from headvox.machine.latest import Latest
 from headvox.ros.losses import Losses
-from headvox.ros.messages import cloud_points, depth_image, intrinsics, stamp_ns
+from headvox.ros.messages import cloud_points, depth_image, distortion_remark, intrinsics, stamp_ns
 from headvox.ros.synchronise import NS, Reading, Synchroniser
 from headvox.ros.transforms import NoTransform, TransformBuffer, set_from
 from headvox_ros.statistics import Statistics
@@ -84,6 +84,8 @@ class Sensors:
         set_from(self.transforms, message, is_static)
 
     def _on_info(self, name: str, message: CameraInfo) -> None:
+        if name not in self._infos and (remark := distortion_remark(message, name)):
+            self._node.get_logger().warning(remark)
         self._infos[name] = message
 
     def _on_reading(self, name: str, message: Any) -> None:

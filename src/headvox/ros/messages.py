@@ -7,6 +7,7 @@ does not fit is a :class:`~headvox.HeadvoxError` that says what was expected and
 from __future__ import annotations
 
 import math
+import re
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8:
 # sensor_msgs/image_encodings: millimetres, the same by its other name, metres (REP 118)
 DEPTH_TYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 MILLIMETRE = 0.001
+_RECTIFIED = re.compile(r"(?<![a-z])rect(ified)?(?![a-z])")
 
 
 class Time(Protocol):
@@ -162,6 +164,20 @@ def intrinsics(info: Any) -> Intrinsics:
             "The camera_info has binning or a region of interest, which is not supported.", "Switch it off."
         )
     return Intrinsics(width, height, float(fx), float(fy), float(cx), float(cy), MILLIMETRE)
+
+
+def distortion_remark(info: Any, depth_topic: str) -> str:
+    """Return what to say where a depth image may not be rectified, and is read as if it were; empty where it is.
+
+    Its CameraInfo has distortion, and its topic does not say that it was taken out. Whether the image itself has it
+    nobody knows: drivers give the distortion of the lens beside rectified images, too.
+    """
+    if not any(value != 0.0 for value in info.d) or _RECTIFIED.search(depth_topic.lower()):
+        return ""
+    return (
+        f"{depth_topic}: its camera_info has distortion ({info.distortion_model[:40]!r}), the image is "
+        "read as a rectified one. If it is not, rectify it first: image_proc does."
+    )
 
 
 def _bytes(data: Any, needed: int, what: str) -> npt.NDArray[np.uint8]:

@@ -72,8 +72,9 @@ class BagSource:
         except BaseException:
             self.bag.close()
             raise
-        if self.placing.note:
-            say(self.placing.note)
+        for note in (*(sensor.note for sensor in self.sensors), self.placing.note):
+            if note:
+                say(note)
         self.length = self.bag.topics[self.sensors[0].topic].count if len(self.sensors) == 1 else None
         self._by_topic = {sensor.topic: sensor for sensor in self.sensors}
         self._moving = transform_topics(self.bag)

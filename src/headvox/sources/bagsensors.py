@@ -13,7 +13,7 @@ import numpy as np
 from headvox.data import F64, Intrinsics
 from headvox.errors import HeadvoxError, Undecided
 from headvox.ros.bagfile import CAMERA_INFO, CLOUD, IMAGE, TRANSFORMS, Bag
-from headvox.ros.messages import DEPTH_TYPES, info_topic, intrinsics
+from headvox.ros.messages import DEPTH_TYPES, distortion_remark, info_topic, intrinsics
 from headvox.ros.transforms import NoTransform, TransformBuffer, set_from
 from headvox.sources.options import ASSUMED, SourceOptions, assumed_mount, listed, mounted
 
@@ -26,13 +26,17 @@ _LOOKED_AT = 2000  # messages of /tf that the tree of frames is learnt from
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A topic that is read: ``camera`` is None for clouds; ``frame`` is the frame_id of its first message."""
+    """A topic that is read: ``camera`` is None for clouds; ``frame`` is the frame_id of its first message.
+
+    ``note`` is what the user is told of it, empty where there is nothing to tell.
+    """
 
     topic: str
     frame: str
     camera: Intrinsics | None
     words: str
     has_stamps: bool
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,14 +116,15 @@ def _sensor(bag: Bag, name: str, asked: bool) -> Sensor | str:
     is_depth = first.encoding in DEPTH_TYPES and (asked or first.encoding != "mono16" or "depth" in name)
     if not is_depth:
         return f"its encoding is {first.encoding[:40]!r}, expected a depth image: {' or '.join(DEPTH_TYPES)}"
-    camera = _camera_of(bag, name, frame, (first.width, first.height))
-    if camera is None:
+    info = _info_of(bag, name, frame, (first.width, first.height))
+    if info is None:
         return "there is no CameraInfo of its frame and size"
-    return Sensor(name, frame, camera, f"depth, {first.width}x{first.height}, {first.encoding}", has_stamps)
+    words = f"depth, {first.width}x{first.height}, {first.encoding}"
+    return Sensor(name, frame, intrinsics(info), words, has_stamps, distortion_remark(info, name))
 
 
-def _camera_of(bag: Bag, topic: str, frame: str, size: tuple[int, int]) -> Intrinsics | None:
-    """Return the intrinsics of a depth image: those beside it, else those of its frame and size."""
+def _info_of(bag: Bag, topic: str, frame: str, size: tuple[int, int]) -> Any | None:
+    """Return the CameraInfo of a depth image: the one beside it, else one of its frame and size."""
     infos = [other.name for other in bag.topics.values() if other.type == CAMERA_INFO]
     beside = [info_topic(topic)] if info_topic(topic) in infos else []
     for name in (*beside, *infos):
@@ -127,7 +132,7 @@ def _camera_of(bag: Bag, topic: str, frame: str, size: tuple[int, int]) -> Intri
         if info is None or (info.width, info.height) != size:
             continue
         if name in beside or info.header.frame_id.lstrip("/") == frame:
-            return intrinsics(info)
+            return info
     return None
 
 

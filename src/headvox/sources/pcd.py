@@ -14,7 +14,7 @@ from headvox.frames import as_rigid, placed
 from headvox.sources import lzf
 from headvox.sources.check import Column, as_points
 from headvox.sources.content import CloudFile
-from headvox.sources.text import parse_numbers
+from headvox.sources.text import parse_numbers, too_many_numbers
 
 _MAX_HEADER_BYTES = 1 << 16
 _MAX_POINT_BYTES = 1 << 20
@@ -178,7 +178,9 @@ def _ascii(body: memoryview, header: Header, name: str) -> dict[str, Column]:
     width = sum(f.count for f in header.fields)
     if len(numbers) < header.points * width:
         raise _truncated(header, len(numbers) // width, name)
-    table = numbers[: header.points * width].reshape(header.points, width)
+    if len(numbers) > header.points * width:
+        raise too_many_numbers(name, len(numbers), header.points * width)
+    table = numbers.reshape(header.points, width)
     columns: dict[str, Column] = {}
     at = 0
     for f in header.fields:

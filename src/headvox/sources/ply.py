@@ -16,7 +16,7 @@ from headvox.errors import HeadvoxError
 from headvox.mesh import sample_surface, triangulate
 from headvox.sources.check import Column, as_points, check_cloud
 from headvox.sources.content import CloudFile
-from headvox.sources.text import parse_numbers
+from headvox.sources.text import parse_numbers, too_many_numbers
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -108,11 +108,16 @@ def read_ply_mesh(data: bytes, name: str) -> tuple[F32, I64]:
 def _open(data: bytes, name: str) -> tuple[str, Bytes, dict[str, Table]]:
     """Return the encoding, the body, and where everything lies in it."""
     encoding, elements, body_start = _header(data, name)
-    if encoding == "ascii":  # an ASCII body becomes a binary one in which everything is a double
-        body = parse_numbers(data[body_start:], name).view(np.uint8)
-    else:
+    if encoding != "ascii":
         body = np.frombuffer(data, dtype=np.uint8, offset=body_start)
-    return encoding, body, _tables(body, elements, name)
+        return encoding, body, _tables(body, elements, name)[0]
+    # An ASCII body becomes a binary one in which everything is a double.
+    numbers = parse_numbers(data[body_start:], name)
+    body = numbers.view(np.uint8)
+    tables, end = _tables(body, elements, name)
+    if len(tables) == len(elements) and end < len(body):
+        raise too_many_numbers(name, len(numbers), end // 8)
+    return encoding, body, tables
 
 
 def _surface(body: Bytes, tables: dict[str, Table], name: str) -> tuple[F32, I64]:
@@ -170,8 +175,8 @@ def _length_dtype(type_name: str, encoding: str, name: str) -> np.dtype[np.gener
     return dtype
 
 
-def _tables(body: Bytes, elements: Iterable[Element], name: str) -> dict[str, Table]:
-    """Find where every row lies, up to the last element that is of use."""
+def _tables(body: Bytes, elements: Iterable[Element], name: str) -> tuple[dict[str, Table], int]:
+    """Find where every row lies, up to the last element that is of use, and where that ends."""
     wanted = {"vertex", "face"} & {element.name for element in elements}
     tables: dict[str, Table] = {}
     start = 0
@@ -182,7 +187,7 @@ def _tables(body: Bytes, elements: Iterable[Element], name: str) -> dict[str, Ta
         wanted.discard(element.name)
     if "vertex" not in tables:
         raise HeadvoxError(f"{name}: the PLY file has no element 'vertex'.", _DAMAGED)
-    return tables
+    return tables, start
 
 
 def _locate(body: Bytes, start: int, element: Element, name: str) -> tuple[Table, int]:

@@ -29,3 +29,11 @@ def parse_numbers(text: bytes, name: str) -> F64:
                 "The file is damaged or not ASCII.",
             ) from None
     return numbers
+
+
+def too_many_numbers(name: str, numbers: int, promised: int) -> HeadvoxError:
+    """Say that a text has more numbers than its header promises: with a column more all would be read shifted."""
+    return HeadvoxError(
+        f"{name}: the header promises {promised} numbers, the body has {numbers}.",
+        "Is a column, or a point, missing in the header?",
+    )

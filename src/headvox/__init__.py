@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from headvox.data import BadFrame as BadFrame
     from headvox.data import Cloud as Cloud
     from headvox.data import DepthImage as DepthImage
+    from headvox.data import Expected as Expected
     from headvox.data import Frame as Frame
     from headvox.data import Heads as Heads
     from headvox.data import Intrinsics as Intrinsics
@@ -29,6 +30,7 @@ _HOME = {
     "DepthImage": "headvox.data",
     "Detector": "headvox.pipeline",
     "DetectorConfig": "headvox.config",
+    "Expected": "headvox.data",
     "Frame": "headvox.data",
     "Heads": "headvox.data",
     "HeadvoxError": "headvox.errors",

@@ -33,7 +33,7 @@ def check_frame(frame: Frame | BadFrame) -> None:
     """Raise HeadvoxError where a reading has another shape or type than it should, or a place that is not rigid."""
     if isinstance(frame, BadFrame):
         raise HeadvoxError(f"There is nothing in a bad frame: {frame.reason}", "Leave it out.")
-    _check_kind(frame, Frame, "detect_frame")
+    check_kind(frame, Frame, "detect_frame")
     as_stamp(frame.stamp_ns)
     _check_readings(frame.clouds, Cloud, "clouds")
     _check_readings(frame.depths, DepthImage, "depths")
@@ -52,10 +52,11 @@ def _check_readings(readings: object, kind: type, name: str) -> None:
         got = f"expected a tuple of {kind.__name__}, got {type(readings).__name__}"
         raise HeadvoxError(f"{name} of the frame: {got}.", f"Write {name}=(reading,).")
     for reading in readings:
-        _check_kind(reading, kind, f"{name} of the frame")
+        check_kind(reading, kind, f"{name} of the frame")
 
 
-def _check_kind(thing: object, kind: type, where: str) -> None:
+def check_kind(thing: object, kind: type, where: str) -> None:
+    """Raise HeadvoxError where ``thing`` is no ``kind``, a dataclass of headvox; ``where`` says what it was for."""
     if not isinstance(thing, kind):
         made = f"{kind.__name__}({', '.join(field.name for field in fields(kind))})"
         raise HeadvoxError(
@@ -100,7 +101,7 @@ def _check_image(image: DepthImage) -> None:
         got = f"{getattr(depth, 'dtype', type(depth).__name__)} {getattr(depth, 'shape', '')}"
         expected = "expected a (height, width) uint16 depth image"
         raise HeadvoxError(f"{image.name}: {expected}, got {got}.", "Convert it.")
-    _check_kind(camera, Intrinsics, f"{image.name}: intrinsics")
+    check_kind(camera, Intrinsics, f"{image.name}: intrinsics")
     if depth.size == 0 or depth.shape != (camera.height, camera.width):
         raise HeadvoxError(
             f"{image.name}: the image is {depth.shape[1]}x{depth.shape[0]}, its camera "

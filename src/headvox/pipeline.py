@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from headvox.assemble import MOST_POSES, as_heads, best_apart, with_poses
-from headvox.check import check_frame, knows_an_origin, nothing_in_range
+from headvox.check import check_frame, check_kind, knows_an_origin, nothing_in_range
 from headvox.config import DetectorConfig, given_or_default
 from headvox.cuda.detect import DEVICE_STAGES, OnDevice
 from headvox.cuda.device import BATCH, DeviceLost, use_device
@@ -147,8 +147,10 @@ class Detector:
 
         Raises:
             HeadvoxError: no reading, or one of the wrong shape or dtype, a transform that is not rigid, intrinsics or a
-                stamp that are no numbers, or nothing within range.
+                stamp that are no numbers, something else than Expected, or nothing within range.
         """
+        if expected is not None:
+            check_kind(expected, Expected, "detect_frame: expected")
         with self._alone:
             if self.on_device:
                 heads = self._detect_together([frame], [expected])[0]

@@ -9,7 +9,7 @@ import pytest
 import scenes
 from busts import camera_frame, everything, two_busts
 
-from headvox import Cloud, DepthImage, Detector, Frame, Heads, HeadvoxError, Intrinsics
+from headvox import Cloud, DepthImage, Detector, Frame, Heads, HeadvoxError, Intrinsics, Tracker
 from headvox.config import DetectorConfig
 from headvox.data import BadFrame
 from headvox.masks.read import parse_cascade
@@ -179,6 +179,9 @@ def test_a_reading_of_another_kind_is_told_with_what_makes_one(make):
         (lambda: detector.detect_depth(replace(image, intrinsics=(3, 2))), "expected headvox.Intrinsics, got tuple"),
         (lambda: detector.detect_depth(replace(image, T_world_camera=np.eye(4).tolist())), "got list"),
         (lambda: detector.detect_frame(Frame(0, (Cloud("c", points, np.eye(4).tolist()),))), "got list"),
+        (lambda: detector.detect_frame(Frame(0, (cloud,)), Heads()), r"expected: expected headvox\.Expected, got H"),
+        (lambda: Tracker().update(None, Frame(0)), r"Tracker\.update: heads: expected headvox.Heads, got NoneType"),
+        (lambda: Tracker().update(Heads(), BadFrame(0, "dark")), "frame: expected headvox.Frame, got BadFrame"),
     ]:  # fmt: skip
         with pytest.raises(HeadvoxError, match=told) as error:
             call()

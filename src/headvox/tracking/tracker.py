@@ -13,7 +13,7 @@ from collections import Counter
 
 import numpy as np
 
-from headvox.check import as_stamp
+from headvox.check import as_stamp, check_kind
 from headvox.config import TrackerConfig, given_or_default
 from headvox.data import F64, I64, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
@@ -99,8 +99,10 @@ class Tracker:
         frame whose stamp is not after the last one's is not tracked: its heads come back as tentative tracks.
 
         Raises:
-            HeadvoxError: a stamp that is not in whole nanoseconds.
+            HeadvoxError: no heads, no frame, or a stamp that is not in whole nanoseconds.
         """
+        check_kind(heads, Heads, "Tracker.update: heads")
+        check_kind(frame, Frame, "Tracker.update: frame")
         stamp_ns = as_stamp(frame.stamp_ns)
         with self._turns:
             if not self._is_next(stamp_ns):

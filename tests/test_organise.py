@@ -15,6 +15,7 @@ from headvox import (
     Detector,
     Frame,
     Heads,
+    HeadvoxError,
     Intrinsics,
     Tracker,
     TrackerConfig,
@@ -163,6 +164,9 @@ def refused():
     yield "one point, again and again", np.ones((5000, 3))
     yield "infinite", np.full((1000, 3), np.inf)
     yield "huge", 1e30 * lidar
+    yield "nearly flat", np.abs(lidar) * [1e19, 1e19, 1e-38]
+    yield "nearly in one place", 1e-38 * points
+    yield "all in one place", np.full((5000, 3), 1e-38)
     yield "an image that is too wide", wide(points)
 
 
@@ -264,6 +268,12 @@ def in_their_frames(frame: Frame) -> Frame:
         for image, placed in zip(images, frame.depths, strict=True)
     )
     return Frame(frame.stamp_ns, clouds=tuple(clouds))
+
+
+def test_a_camera_s_cloud_in_millimetres_is_told():
+    points = 1000.0 * cloud_of(image_of(SMALL)).points
+    with pytest.raises(HeadvoxError, match=r"camera: half .* Convert them to metres"):
+        Detector().detect_frame(Frame(0, clouds=(Cloud("camera", points, np.eye(4)),)))
 
 
 def test_a_detector_finds_in_clouds_what_it_finds_in_images():

@@ -32,7 +32,7 @@ from headvox.machine.simd import (
     within,
 )
 from headvox.machine.threads import Threads
-from headvox.pixelgrid import BIAS, MOST_OFF, OFF_PIXEL, Grid, grid_of, widened
+from headvox.pixelgrid import BIAS, LEAST_POINTS, MOST_OFF, OFF_PIXEL, Grid, grid_of, widened
 from headvox.slabs import shares_of
 from headvox.voxelize import moved
 
@@ -64,7 +64,7 @@ class Organiser:
         return replace(frame, clouds=clouds, depths=(*made, *frame.depths))
 
     def _image(self, cloud: Cloud, key: tuple[int, int]) -> DepthImage | None:
-        points, T = cloud.points, cloud.T_world_sensor
+        points, T = np.asarray(cloud.points, dtype=np.float32), cloud.T_world_sensor
         grid = None if T is None else grid_of(points)
         if T is None or grid is None or grid.is_too_large(len(points)):
             return None
@@ -74,7 +74,9 @@ class Organiser:
             if grid.is_too_large(len(points)):
                 return None
             depth, (on, between, outside) = self._entered(points, grid, key)
-        if outside or between > MOST_OFF * (on + between) or np.count_nonzero(depth) != on:
+        if outside or on < LEAST_POINTS or between > MOST_OFF * (on + between):
+            return None
+        if np.count_nonzero(depth) != on:
             return None  # two points on one ray are no image's
         return DepthImage(cloud.name, depth, grid.lens(), T @ grid.T_sensor_optical)
 

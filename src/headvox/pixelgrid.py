@@ -20,6 +20,8 @@ LEAST_POINTS = 500
 LEAST_STEPS, MOST_STEPS, FINEST = 8, 1024, 5e-5
 """How often neighbours have to differ along each axis of the image, how many of these are sorted, and by how much of
 the distance they have to differ to count."""
+STEEPEST = 20.0
+"""Slope of the rays that may be a camera's: 87 degrees off its axis."""
 OFF_PIXEL, MOST_OFF = 0.25, 0.01
 """How far from the middle of its pixel a point may be, in pixels, and the share of points that may be farther."""
 UNIT_PX = 1 / 256
@@ -81,7 +83,7 @@ def grid_of(points: F32) -> Grid | None:
     sample = sample[:, (size > 0.0) & (size < np.inf)]
     for T in AXES:
         right, down, ahead = T[:3, :3].T @ sample
-        seen = ahead > 0.0
+        seen = np.maximum(np.abs(right), np.abs(down)) < STEEPEST * ahead
         count = np.count_nonzero(seen)
         if count < max(LEAST_POINTS, (1.0 - MOST_OFF) * sample.shape[1]):
             continue  # a camera looks ahead

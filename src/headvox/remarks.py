@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from headvox.data import Frame
-from headvox.run import Report
+from headvox.run import UNTRACKED, Report
 from headvox.sources import Source
 
 
@@ -37,8 +37,10 @@ class Remarks:
             return
         self._any = True
         from headvox.calibrate.floor import wrong_floor
+        from headvox.machine.threads import Threads
+        from headvox.organise import Organiser
 
-        note = wrong_floor(frame)
+        note = wrong_floor(Organiser(Threads(1)).organised(frame))
         if note is not None:
             self._tell(note)
 
@@ -49,11 +51,13 @@ class Remarks:
         self._more = 0
 
     def ended(self, source: Source, report: Report) -> None:
-        """Tell at the end of a run why nothing may have been found, and what its velocities depend on."""
+        """Tell at the end of a run why nothing may have been found or followed, and what its velocities depend on."""
         from headvox.sources.folder import FolderSource
         from headvox.sources.recording import RecordingSource
 
         if report.ids and isinstance(source, FolderSource) and source.rate_hz is None:
             self._tell("velocities are for 30 clouds a second, for files have no stamps: see --rate")
+        for what, count in report.untracked.items():
+            self._tell(f"{count} {UNTRACKED[what]}")
         if report.heads == 0 and not report.interrupted and not isinstance(source, RecordingSource):
             self._tell("no head in any frame: headvox expects metres, and a world whose z points up")

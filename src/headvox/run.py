@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from headvox.tracking.tracker import Tracker
 
 RECENT = 100_000  # frames that the percentiles look back over: a run may last for weeks
+UNTRACKED = {
+    "repeated": "frames with the stamp of the one before, not tracked",
+    "late": "frames with an earlier stamp, not tracked",
+    "resets": "jumps back in time, tracks begun anew",
+}
+"""What the counts of :attr:`Report.untracked` are, in words."""
 
 
 class FrameDetector(Protocol):

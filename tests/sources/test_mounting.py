@@ -6,6 +6,7 @@ import pytest
 from headvox import DepthImage, Detector, HeadvoxError, Intrinsics, open_source, sample_folder
 from headvox.frames import OPTICAL, inverse, transform, unproject
 from headvox.pixelgrid import AXES
+from headvox.remarks import Remarks
 from headvox.sources.describe import describe
 from headvox.sources.mounting import BODY, WORDS, axes_of
 from headvox.sources.options import SourceOptions, mount
@@ -108,3 +109,17 @@ def test_who_forgets_the_mount_of_a_camera_whose_z_is_not_up_is_told_once(tmp_pa
 def test_a_recording_takes_no_mount():
     with pytest.raises(HeadvoxError, match="--mount for these and for files of clouds"):
         opened(sample_folder())
+
+
+def test_a_mount_that_is_plainly_wrong_is_told(tmp_path):
+    image = next(iter(open_source(sample_folder()))).depths[0]
+    np.save(tmp_path / "one.npy", seen_in(image, np.eye(4)))
+    body = image.T_world_camera @ inverse(OPTICAL)
+    for height, told in ((0.0, 0), (0.6, 1)):
+        place = body.copy()
+        place[2, 3] += height
+        source, _ = opened(tmp_path / "one.npy", place)
+        notes: list[str] = []
+        Remarks(notes.append).used(next(iter(source)))
+        assert len(notes) == told
+        assert all("one.npy: what looks like the floor" in note and "z = 0.6" in note for note in notes)

@@ -15,6 +15,7 @@ from headvox.data import BadFrame, Frame
 from headvox.errors import HeadvoxError
 from headvox.remarks import Remarks
 from headvox.run import Report
+from headvox.sample import sample_folder
 from headvox.sources import open_source
 from headvox.sources.check import as_points, check_cloud
 from headvox.sources.describe import describe
@@ -104,6 +105,16 @@ def test_a_run_whose_velocities_depend_on_a_rate_that_nobody_said_tells_it_once(
 
     assert told(1, None) == ["velocities are for 30 clouds a second, for files have no stamps: see --rate"]
     assert told(None, None) == told(0, None) == told(1, 10.0) == []
+
+
+def test_frames_that_were_not_tracked_are_told_whatever_is_written():
+    lines: list[str] = []
+    report = Report(frames=9, heads=9, untracked={"repeated": 3, "resets": 1})
+    Remarks(lines.append).ended(open_source(sample_folder()), report)
+    assert lines == [
+        "3 frames with the stamp of the one before, not tracked",
+        "1 jumps back in time, tracks begun anew",
+    ]
 
 
 def test_natural_order():

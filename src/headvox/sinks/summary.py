@@ -6,14 +6,9 @@ import numpy as np
 
 from headvox.commands.table import table
 from headvox.data import Heads
-from headvox.run import Report
+from headvox.run import UNTRACKED, Report
 
 PERCENTILES = (50, 95, 99)
-_CLOCK = {
-    "repeated": "frames with the stamp of the one before, not tracked",
-    "late": "frames with an earlier stamp, not tracked",
-    "resets": "jumps back in time, tracks begun anew",
-}
 
 
 def summary(report: Report) -> str:
@@ -41,7 +36,7 @@ def _counts(report: Report) -> str:
         ["heads", str(report.heads)],
         ["frames with heads", str(report.frames_with_heads)],
         *([] if report.ids is None else [["heads with an id", str(report.ids)]]),
-        *([_CLOCK[what], str(count)] for what, count in report.untracked.items()),
+        *([UNTRACKED[what], str(count)] for what, count in report.untracked.items()),
         ["Hz, reading included", f"{hertz:.1f}"],
     ]
     return table([], rows)

@@ -52,7 +52,7 @@ class Organiser:
         ]
 
     def organised(self, frame: Frame, slot: int = 0) -> Frame:
-        """Return ``frame`` with depth images for those of its clouds that were some; itself where there is none.
+        """Return ``frame`` with depth images for those of its clouds that were some; itself where no sensor is placed.
 
         The images lie in memory that the next call with the same ``slot`` overwrites.
         """

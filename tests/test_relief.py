@@ -11,6 +11,7 @@ from headvox.data import Cloud, DepthImage, Expected, Frame, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.evolve.write import relief_lines
 from headvox.frames import unproject
+from headvox.machine.threads import Threads
 from headvox.masks.cascade import Relief, Spot
 from headvox.masks.compile import CompiledRelief, compile_cascade
 from headvox.masks.describe import describe_cascade
@@ -22,6 +23,7 @@ from headvox.sources import open_source
 
 SPOTS = np.array([(0.03 * side, 0.03 * up) for side in range(5) for up in range(-6, 7)])
 RADIUS = np.array([0.1])
+ALONE = Threads(1)
 DEFAULT = (resources.files("headvox") / "cascades" / "default.toml").read_text("utf-8")
 BEFORE = DEFAULT[: DEFAULT.index("[relief]")]
 
@@ -132,7 +134,8 @@ def test_the_trees_of_the_default_add_up_as_the_naive_twin_says():
     for lacking in (never, rng.integers(-3000, 9000, len(centres))):
         rows = zip(seen, best, lacking.tolist(), strict=True)
         wanted = [naive_relief.gain(row, source, lacks) if there else 0 for row, there, lacks in rows]
-        assert gains_of(images, centres, radii, lacking, relief).tolist() == wanted
+        for threads in (ALONE, Threads(3)):
+            assert gains_of(images, centres, radii, lacking, relief, threads).tolist() == wanted
         assert len(set(wanted)) > 10
         said.append(wanted)
     assert said[0] != said[1]
@@ -143,7 +146,7 @@ def test_what_lacks_too_much_after_the_first_trees_is_given_up(lacking, gained):
     image = sphere_before_a_wall(scenes.looking_along_x(-1.2, 0.0, 0.0))
     relief = compiled(Relief(2.0, (Spot("s", 0.0, 0.0),), (0.5, 0.25), first=1, reach=0.5))
     lacks = np.array([lacking])
-    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, relief).tolist() == [1024 * gained]
+    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, relief, ALONE).tolist() == [1024 * gained]
 
 
 def test_no_tree_is_given_up_unless_the_file_says_so():
@@ -152,7 +155,7 @@ def test_no_tree_is_given_up_unless_the_file_says_so():
     assert (read.relief.first, read.relief.reach) == (0, np.inf)
     image = sphere_before_a_wall(scenes.looking_along_x(-1.2, 0.0, 0.0))
     lacks = np.array([1024])  # all that the trees may change
-    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, compiled(read.relief)).tolist() == [512]
+    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, compiled(read.relief), ALONE).tolist() == [512]
 
 
 @pytest.mark.parametrize(("leaf", "gained"), [(0.5, 0.5), (9.0, 1.0), (-9.0, -1.0)])
@@ -160,9 +163,11 @@ def test_the_score_changes_by_no_more_than_the_cascade_allows(leaf, gained):
     image = sphere_before_a_wall(scenes.looking_along_x(-1.2, 0.0, 0.0))
     relief = compiled(Relief(1.0, (Spot("s", 0.0, 0.0),), (leaf,)))
     lacks = np.zeros(1, np.int64)
-    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, relief).tolist() == [1024 * gained]
-    assert gains_of((image,), np.full((1, 3), 9.0), RADIUS, lacks, relief).tolist() == [0]  # out of view
-    assert gains_of((), np.zeros((1, 3)), RADIUS, lacks, relief).tolist() == [0]
+    assert gains_of((image,), np.zeros((1, 3)), RADIUS, lacks, relief, ALONE).tolist() == [1024 * gained]
+    assert gains_of((image,), np.full((1, 3), 9.0), RADIUS, lacks, relief, ALONE).tolist() == [
+        0
+    ]  # out of view
+    assert gains_of((), np.zeros((1, 3)), RADIUS, lacks, relief, ALONE).tolist() == [0]
 
 
 @pytest.fixture(scope="module")
@@ -204,10 +209,10 @@ def test_where_a_head_is_expected_less_is_enough(tmp_path, sample):
     expected = Expected(heads.centres[-1:], np.full((1, 4), np.nan), np.array([0.05]))
     common = (sample.depths, relief, int(steps[-1]) + 100)
     peaks = (heads.centres, heads.radii, steps)
-    which, scores = look_again(*peaks, *common, 200, expected, 0.05)
+    which, scores = look_again(*peaks, *common, 200, expected, 0.05, ALONE)
     assert which.tolist() == [*np.flatnonzero(steps >= steps[-1] + 100), len(heads) - 1]
     assert scores.tolist() == steps[which].tolist()
-    without, _ = look_again(*peaks, *common, 200, None, 0.05)
+    without, _ = look_again(*peaks, *common, 200, None, 0.05, ALONE)
     assert len(heads) - 1 not in without
     again = with_relief(tmp_path, 0.0, float(steps[-1] + 100) / 1024).detect_frame(sample, expected)
     np.testing.assert_array_equal(again.scores, heads.scores[which])

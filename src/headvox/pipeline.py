@@ -210,7 +210,7 @@ class Detector:
     def _detect_together(self, frames: Sequence[Frame], expected: Sequence[Expected | None]) -> list[Heads]:
         """Return the heads in up to :data:`BATCH` frames: at once on a GPU; without, or when it fails, one by one."""
         if self.on_device:
-            self.device = self.device or OnDevice(self._config, self.cascade, self._organiser)
+            self.device = self.device or OnDevice(self._config, self.cascade, self._organiser, self._threads)
             try:
                 heads = self.device.detect(frames, expected, self.stage_ms)
                 self.candidates = self.device.candidates
@@ -423,7 +423,7 @@ class Detector:
         scores, relief = scores[kept], self.cascade.relief
         limits = (least, slack_of(self._config, expected), expected, memory.lattice.voxel_m)
         if relief is not None and asks_cameras(frame, memory.sees):
-            again, scores = look_again(centres, radii, scores, frame.depths, relief, *limits)
+            again, scores = look_again(centres, radii, scores, frame.depths, relief, *limits, self._threads)
             kept, centres, radii = kept[again], centres[again], radii[again]
         votes = self.cascade.votes
         yaws = None if votes is None else votes.yaws_rad[memory.yaws[peaks[kept]]]

@@ -9,6 +9,7 @@ farther than the centre the surface is. Small trees over these numbers, and over
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,10 @@ from headvox.data import F64, I16, I64, DepthImage, Expected
 from headvox.keep import keep
 from headvox.machine.kernels import bare_kernel, kernel, read_only
 from headvox.machine.simd import LANES
+from headvox.machine.threads import Threads
 from headvox.masks.cascade import MEASURES, SIDES
 from headvox.masks.compile import CompiledRelief
+from headvox.masks.forest import sum_of_leaves
 from headvox.visibility import NEAREST_M, read_pixels, world_to_pixels
 from headvox.vote import order
 
@@ -101,12 +104,12 @@ def set_sizes(centres, radii, relief):
 
 
 @kernel
-def look_closely(depth, scale, camera, origin, centres, spots, best, relief):
-    """Write what one camera measured about each of ``centres`` (N, 3), world, to ``relief`` (N, 2 K + 4), mm.
+def look_closely(depth, scale, camera, origin, centres, begin, step, spots, best, relief):
+    """Write what one camera measured about ``centres`` (N, 3), world, to ``relief`` (N, 2 K + 4), mm.
 
-    Of the measures it writes the first two. It does so where the camera sees more of a head than any before it:
-    ``best`` (N,) says how much that was. ``camera`` is (3, 4): rows that give u·Z, v·Z and Z of a world point;
-    ``origin`` (3,) is where it stands.
+    That is every ``step``-th of them from ``begin`` on. Of the measures it writes the first two. It does so where the
+    camera sees more of a head than any before it: ``best`` (N,) says how much that was. ``camera`` is (3, 4): rows
+    that give u·Z, v·Z and Z of a world point; ``origin`` (3,) is where it stands.
     """
     count = spots.shape[0]
     lanes = -(-2 * count // LANES) * LANES
@@ -119,7 +122,7 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):
     medians = np.empty(lanes, np.int16)
     middle, right, up = np.empty(3), np.empty(3), np.empty(3)
     set_places(spots, places)
-    for i in range(centres.shape[0]):
+    for i in range(begin, centres.shape[0], step):
         x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
         dx, dy, dz = x - origin[0], y - origin[1], z - origin[2]
         flat = np.sqrt(dx * dx + dy * dy)
@@ -153,36 +156,24 @@ def look_closely(depth, scale, camera, origin, centres, spots, best, relief):
         relief[i, 2 * count], relief[i, 2 * count + 1] = in_mm(away), in_mm(dz / away)
 
 
-@bare_kernel
-def sum_of_leaves(measured, nodes, roots, deepest, at):
-    """Return what the trees of ``roots`` (T,) say of what was ``measured`` (2 K + 4,); ``at`` (T,) is for its use."""
-    for t in range(roots.shape[0]):
-        at[t] = roots[t]
-    for _ in range(deepest):  # all trees, a step at a time: no step has to wait for the one before
-        for t in range(np.uint64(roots.shape[0])):
-            node = at[t]
-            at[t] = nodes[node + 2 + (measured[nodes[node]] > nodes[node + 1])]
-    total = np.int64(0)
-    for t in range(roots.shape[0]):
-        total += nodes[at[t] + 1]
-    return total
-
-
 @kernel
-def add_trees(relief, best, nodes, roots, deepest, first, reach, most, lacking, gains):
-    """Write what the trees say of each row of ``relief`` (N, 2 K + 4) to ``gains`` (N,), at most ``most`` either way.
+def add_trees(relief, best, begin, step, forest, first, reach, most, lacking, gains):
+    """Write what the trees of ``forest`` say of rows of ``relief`` (N, 2 K + 4) to ``gains`` (N,), within ``most``.
 
     Where the ``first`` trees leave more than ``reach`` of what is ``lacking`` (N,) to be a head, no others are asked.
     Of what no camera saw (``best`` (N,) is 0) they say nothing.
     """
-    at = np.empty_like(roots)
-    for i in range(relief.shape[0]):
+    nodes, leaves, roots, deepest = forest
+    at, measured = np.empty_like(roots), np.empty(relief.shape[1], np.int64)
+    for i in range(begin, relief.shape[0], step):
         gains[i] = 0
         if not best[i] > 0.0:
             continue
-        total = sum_of_leaves(relief[i], nodes, roots[:first], deepest, at[:first])
+        for k in range(relief.shape[1]):
+            measured[k] = relief[i, k]  # so that the compiler makes vectors of looking it up
+        total = sum_of_leaves(measured, nodes, leaves, roots[:first], deepest, at[:first])
         if min(max(total, -most), most) + reach >= lacking[i]:
-            total += sum_of_leaves(relief[i], nodes, roots[first:], deepest, at[first:])
+            total += sum_of_leaves(measured, nodes, leaves, roots[first:], deepest, at[first:])
         gains[i] = min(max(total, -most), most)
 
 
@@ -191,43 +182,60 @@ def relief_about(images: Sequence[DepthImage], centres: F64, radii: F64, spots: 
 
     ``centres`` (N, 3), world, and ``radii`` (N,) are theirs, ``spots`` (K, 2) the places to look at, all metres.
     """
-    best, features = np.zeros(len(centres)), len(SIDES) * len(spots) + len(MEASURES)
-    relief = np.zeros((len(centres), features), np.int16)
-    set_sizes(centres, radii, relief)
-    for image in images:
-        camera, origin = world_to_pixels(image)
-        scale = image.intrinsics.depth_scale
-        look_closely(read_only(image.depth), scale, camera, origin, centres, spots, best, relief)
+    centres, relief, best = _not_seen(centres, radii, spots)
+    for camera in _cameras_of(images):
+        look_closely(*camera, centres, 0, 1, spots, best, relief)
     return relief, best
 
 
 def gains_of(
-    images: Sequence[DepthImage], centres: F64, radii: F64, lacking: I64, relief: CompiledRelief
-) -> I64:
+    images: Sequence[DepthImage], centres: F64, radii: F64, lacking: I64, relief: CompiledRelief, threads: Threads
+) -> I64:  # fmt: skip
     """Return by how much the scores of candidates change, in steps: 0 where no camera sees them.
 
     ``centres`` (N, 3), world, and ``radii`` (N,) are in metres; ``lacking`` (N,) is how much each scores too little to
     be a head, in steps. Of one that still lacks too much after the first trees, what these say is all.
     """
-    seen, best = relief_about(
-        images, np.ascontiguousarray(centres), np.ascontiguousarray(radii), relief.spots
-    )
-    gains = np.empty(len(centres), np.int64)
-    trees = (relief.nodes, relief.root, relief.deepest, relief.first, relief.reach, relief.most)
-    add_trees(seen, best, *trees, lacking, gains)
+    cameras, gains = _cameras_of(images), np.empty(len(centres), np.int64)
+    centres, measured, best = _not_seen(centres, radii, relief.spots)
+
+    def ask(begin: int, step: int) -> None:
+        for camera in cameras:
+            look_closely(*camera, centres, begin, step, relief.spots, best, measured)
+        limits = (relief.first, relief.reach, relief.most)
+        add_trees(measured, best, begin, step, relief.forest, *limits, lacking, gains)
+
+    # Dealt out like cards: those that score best come first, and are asked most.
+    parts = min(threads.count, len(centres))
+    threads.run(ask, [(part, parts) for part in range(parts)])
     return gains
+
+
+def _not_seen(centres: F64, radii: F64, spots: F64) -> tuple[F64, I16, F64]:
+    """Return ``centres`` as the loops read them, and what is known of candidates before a camera is asked."""
+    centres = np.ascontiguousarray(centres)
+    relief = np.zeros((len(centres), len(SIDES) * len(spots) + len(MEASURES)), np.int16)
+    set_sizes(centres, np.ascontiguousarray(radii), relief)
+    return centres, relief, np.zeros(len(centres))
+
+
+def _cameras_of(images: Sequence[DepthImage]) -> list[tuple[Any, ...]]:
+    """Return what :func:`look_closely` has to know of each camera."""
+    return [
+        (read_only(image.depth), image.intrinsics.depth_scale, *world_to_pixels(image)) for image in images
+    ]
 
 
 def look_again(
     centres: F64, radii: F64, scores: I64, images: Sequence[DepthImage], relief: CompiledRelief, least: int,
-    slack: int, expected: Expected | None, voxel_m: float,
+    slack: int, expected: Expected | None, voxel_m: float, threads: Threads,
 ) -> tuple[I64, I64]:  # fmt: skip
     """Return which peaks are heads after the last look, best first, and what they score then.
 
     ``centres`` (N, 3), world, and ``radii`` (N,) are of the spheres that fit them, in metres. For the numbers in steps
     see :func:`headvox.keep.keep`.
     """
-    scores = scores + gains_of(images, centres, radii, least - slack - scores, relief)
+    scores = scores + gains_of(images, centres, radii, least - slack - scores, relief, threads)
     kept = np.flatnonzero(keep(centres, scores, least, slack, expected, voxel_m))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     return kept, scores[kept]

@@ -12,6 +12,7 @@ from headvox.cuda.readings import Asked, Found
 from headvox.data import Expected, Frame, Heads
 from headvox.keep import asks_cameras, least_before, least_score, slack_of
 from headvox.machine.clock import Clock
+from headvox.machine.threads import Threads
 from headvox.masks.compile import CompiledCascade
 from headvox.organise import Organiser
 from headvox.placing import Placing
@@ -27,14 +28,16 @@ DEVICE_STAGES = ("device", "host")
 class OnDevice:
     """What a detector does with frames on a GPU, by one cascade."""
 
-    def __init__(self, config: DetectorConfig, cascade: CompiledCascade, organiser: Organiser) -> None:
+    def __init__(
+        self, config: DetectorConfig, cascade: CompiledCascade, organiser: Organiser, threads: Threads
+    ) -> None:
         self.config, self.cascade = config, cascade
         self.candidates = 0
         """How many voxels of the last frame passed the gate."""
         self.device: Device | None = None
         """What searches, once there was a frame."""
         self._sees = cascade.source.sees  # asks every tree: not for every frame
-        self._organiser, self._placing = organiser, Placing(config)
+        self._organiser, self._threads, self._placing = organiser, threads, Placing(config)
 
     def detect(
         self, frames: Sequence[Frame], expected: Sequence[Expected | None], stage_ms: dict[str, float]
@@ -82,7 +85,8 @@ class OnDevice:
         common = (asked.slack, asked.expected, asked.lattice.voxel_m)
         if relief is not None and asked.sees:
             least += relief.most
-            kept, scores = look_again(centres, radii, scores, asked.frame.depths, relief, least, *common)
+            images = asked.frame.depths
+            kept, scores = look_again(centres, radii, scores, images, relief, least, *common, self._threads)
             centres, radii, yaws = centres[kept], radii[kept], None if yaws is None else yaws[kept]
             poses = None if poses is None else poses.of(kept, centres)
         heads = as_heads(centres, radii, scores, least, yaws)

@@ -30,6 +30,7 @@ from headvox.masks.cascade import (
     statistics,
     turned,
 )
+from headvox.masks.forest import Forest, plant
 
 SCORE_UNIT = 1024
 FARTHEST_M = 1000.0  # cuts of the last look: nothing that it asks reaches as far, and millimetres fit 32 bits
@@ -115,17 +116,11 @@ UNREACHED = 1e9  # a score that nothing lacks
 
 @dataclass(frozen=True, slots=True)
 class CompiledRelief:
-    """The last look in millimetres. Feature 2 k is the near, 2 k + 1 the far side of spot k; then come the measures.
-
-    ``nodes`` and ``root`` are as those of :class:`CompiledStages`.
-    """
+    """The last look in millimetres. It asks 2 k for the near, 2 k + 1 for the far side of spot k; then the measures."""
 
     spots: npt.NDArray[np.float64]
     """(K, 2) metres to the side and up"""
-    nodes: I32
-    root: I64
-    deepest: int
-    """How many steps the deepest tree takes; a leaf leads to itself."""
+    forest: Forest
     first: int
     reach: int
     """A candidate that lacks more than ``reach``, in steps, after the ``first`` trees is given up."""
@@ -324,13 +319,9 @@ def _compile_relief(relief: Relief) -> CompiledRelief:
     def asked(name: str, metres: float) -> tuple[int, int]:
         return numbers[name], _floor(round(1000.0 * min(max(metres, -FARTHEST_M), FARTHEST_M), 6))
 
-    nodes: list[int] = []
-    roots = [_add_tree(tree, asked, nodes) for tree in relief.trees]
     return CompiledRelief(
         np.array([(spot.side, spot.up) for spot in relief.spots]),
-        np.array(nodes, dtype=np.int32),
-        np.array([root for root, _ in roots], dtype=np.int64),
-        max((depth for _, depth in roots), default=0),
+        plant(relief.trees, asked, lambda leaf: round(leaf * SCORE_UNIT)),
         relief.first,
         math.floor(min(relief.reach, UNREACHED) * SCORE_UNIT),
         math.floor(relief.most * SCORE_UNIT),

@@ -37,8 +37,10 @@ def verify(
         losses[is_expected(heads.centres[: len(losses)], expected, voxel_m)] = 0
     scores[: len(losses)] -= losses
     kept = np.flatnonzero(keep(heads.centres, scores, least, slack, expected, voxel_m))
-    centres = heads.centres[kept]
+    everyone = len(kept) == len(heads) == len(poses.radii)  # as in most frames: then nothing has to be copied
+    rows = slice(None) if everyone else kept
+    centres = heads.centres[rows]
     told = Heads(
-        centres, heads.quaternions[kept], heads.radii[kept], scores[kept] / SCORE_UNIT, sure=scores[kept] >= least
+        centres, heads.quaternions[rows], heads.radii[rows], scores[rows] / SCORE_UNIT, sure=scores[rows] >= least
     )  # fmt: skip
-    return told, poses.of(kept, centres)
+    return told, poses if everyone else poses.of(kept, centres)

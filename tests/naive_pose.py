@@ -58,12 +58,15 @@ def distances(state, points, modes, template):
     q = (points - state[:3]) @ R / scale
     cell = np.floor((q - template.low) / template.voxel_m).astype(int)
     inside = ((cell >= 0) & (cell < template.shape)).all(axis=1)
-    row = template.rows.reshape(*template.shape, -1)[tuple(cell[inside].T)].astype(np.float64)
+    at = np.ravel_multi_index(tuple(cell[inside].T), template.shape)
+    voxels = template.voxels[at]
+    wide, narrow = voxels.view("<i2").astype(np.float64), voxels.view("<i1").astype(np.float64)
     q = q[inside]
     middle = template.low + (cell[inside] + 0.5) * template.voxel_m
-    shape = row[:, 5 : 5 + modes]
-    value = row[:, 0] + ((q - middle) * row[:, 1:4]).sum(axis=1) + shape @ state[13 : 13 + modes]
-    return value, row[:, 1:4], q, row[:, 4], shape, inside
+    gradient, sigma = template.gradient_unit * wide[:, 1:4], template.sigma_unit_m * narrow[:, 8]
+    shape = (template.mode_units_m * narrow[:, 9:25])[:, :modes]
+    value = template.distance_unit_m * wide[:, 0] + ((q - middle) * gradient).sum(axis=1)
+    return value + shape @ state[13 : 13 + modes], gradient, q, sigma, shape, inside
 
 
 def linearise(samples, rays, most, modes, k, upright, template, state):

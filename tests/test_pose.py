@@ -1,3 +1,5 @@
+from importlib.resources import files
+
 import naive_pose
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from headvox.data import Expected
 from headvox.machine.threads import Threads
 from headvox.pose import align, nearby, residuals, settle, trials
 from headvox.pose.fit import FitMemory, Poses, all_turns, expected_turns, fit_poses, upright_turns
-from headvox.pose.template import load_template
+from headvox.pose.template import WORDS, load_template
 from headvox.pose.trials import Scratch
 from headvox.synth.heads import HEADVOX_TO_PAPER, make_shell, sample_identities
 from headvox.synth.portraits import portrait
@@ -122,8 +124,8 @@ def test_normal_equations_equal_the_naive_twin(seed, modes):
     passing = np.ascontiguousarray(rays[naive_pose.even(len(rays), 90)].T)
     n, m = points.shape[1], passing.shape[1]
     work, told = Scratch.new(), np.zeros(residuals.TOLD)
-    work.J[:] = np.nan  # what an earlier fit may have left
-    place = (TEMPLATE, state, work.J, work.A, told)
+    work.J[:], work.words[:] = np.nan, -1  # what an earlier fit may have left
+    place = (TEMPLATE, state, work.J, work.words, work.A, told)
     cost = align.linearise(points, n, passing, m, modes, 4.0, upright, True, *place)
     A = work.A.copy()
     wanted = naive_pose.linearise(samples, rays, (150, 90), modes, 4.0, upright, TEMPLATE, state)
@@ -149,9 +151,9 @@ def test_any_number_of_points_and_rays_equals_the_naive_twin(n, m, away):
     for directions in (samples[:, 3:6], rays[:, 3:6]):
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     state, work, told = random_state(rng), Scratch.new(), np.zeros(residuals.TOLD)
-    work.J[:] = np.nan
+    work.J[:], work.words[:] = np.nan, -1
     cost = align.linearise(
-        samples.T.copy(), n, rays.T.copy(), m, trials.FINE_MODES, 3.0, True, True, TEMPLATE, state, work.J,
+        samples.T.copy(), n, rays.T.copy(), m, trials.FINE_MODES, 3.0, True, True, TEMPLATE, state, work.J, work.words,
         work.A, told,
     )  # fmt: skip
     size = 7 + trials.FINE_MODES
@@ -165,17 +167,37 @@ def test_any_number_of_points_and_rays_equals_the_naive_twin(n, m, away):
         assert told[residuals.COST] == 4.5 * n
 
 
+def test_each_voxel_of_the_template_says_what_the_asset_does():
+    with np.load(files("headvox") / "assets/template.npz") as asset:
+        mean, sigma = (asset[name] * asset[f"{name}_unit_m"] for name in ("mean", "sigma"))
+        modes = asset["modes"] * asset["mode_units_m"][:, None, None, None]
+    count = len(TEMPLATE.voxels) - 1
+    J, words = np.full((residuals.ROWS, count + 1), np.nan), np.full((WORDS, count + 1), -1)
+    J[residuals.VOXEL] = np.arange(count + 1)
+    assert residuals.look_up(0, count + 1, residuals.MODES, TEMPLATE, J, words) == 1
+    residuals.unpack(0, count + 1, residuals.MODES, TEMPLATE, words, J)
+    np.testing.assert_allclose(J[residuals.DISTANCE, :-1], mean.reshape(-1), rtol=1e-12)
+    np.testing.assert_allclose(J[residuals.SIGMA, :-1], sigma.reshape(-1), rtol=1e-12)
+    gradients = np.array(np.gradient(mean, TEMPLATE.voxel_m)).reshape(3, -1)
+    np.testing.assert_allclose(J[:3, :-1], gradients, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        J[7 : 7 + residuals.MODES, :-1], modes.reshape(residuals.MODES, -1), rtol=1e-12
+    )
+    assert J[residuals.SIGMA, -1] > 0.0  # what lies outside
+    assert not J[[0, 1, 2, *range(7, 7 + residuals.MODES), residuals.DISTANCE], -1].any()
+
+
 def cost_of_a_point_behind(ray_x, sigma):
     """Twice what a point on the back of the mean head costs, seen along ``ray_x`` (1: through the face)."""
-    rows = TEMPLATE.rows[:, 0].reshape(TEMPLATE.shape)
+    distances = TEMPLATE.voxels[:-1].view("<i2")[:, 0].reshape(TEMPLATE.shape)
     y, z = (int(-TEMPLATE.low[a] / TEMPLATE.voxel_m) for a in (1, 2))
-    x = int(np.argmax(rows[:, y, z] < 0.0))  # the first voxel inside, from behind
+    x = int(np.argmax(distances[:, y, z] < 0))  # the first voxel inside, from behind
     place = TEMPLATE.low + (np.array([x, y, z]) + 0.5) * TEMPLATE.voxel_m
     samples = np.array([[*place, ray_x, 0.0, 0.0, sigma, 0.001]]).T.copy()
     state, work, told = np.zeros(residuals.STATE), Scratch.new(), np.zeros(residuals.TOLD)
     state[[3, 7, 11]] = 1.0
     cost = align.linearise(
-        samples, 1, np.zeros((6, 0)), 0, 0, 2.5, False, True, TEMPLATE, state, work.J, work.A, told,
+        samples, 1, np.zeros((6, 0)), 0, 0, 2.5, False, True, TEMPLATE, state, work.J, work.words, work.A, told,
     )  # fmt: skip
     return 2.0 * cost, told[residuals.COST]
 

@@ -14,7 +14,7 @@ from headvox.pose.fit import Poses, all_turns, upright_turns
 from headvox.pose.nearby import MOST_SAMPLES, RAY, SAMPLE
 from headvox.pose.residuals import ROWS, STATE, TOLD
 from headvox.pose.settle import Refined
-from headvox.pose.template import load_template
+from headvox.pose.template import WORDS, load_template
 from headvox.pose.trials import (
     COARSE_SAMPLES,
     FINE_RAYS,
@@ -61,7 +61,9 @@ class Fits:
         self.passing = _reals(rows, RAY, FINE_RAYS + POLISH_RAYS)
         self.turns = _reals(rows, 9)
         self.pose_blocks = max(POSE_BLOCKS // frames, 1)
-        self.scratch = _reals(frames * self.pose_blocks, ROWS, pose.COLUMNS)
+        blocks = frames * self.pose_blocks
+        words = cuda.device_array((blocks, WORDS, pose.COLUMNS), np.int64)
+        self.scratch = pose.Scratch(_reals(blocks, ROWS, pose.COLUMNS), words)
         self.starts = pose.Starts(
             *(_reals(rows, each, *shape) for shape in ((), (STATE,), (STATE,), (TOLD,)))
         )
@@ -72,9 +74,12 @@ class Fits:
         self.upright, self.anyhow = cuda.to_device(upright_turns()), cuda.to_device(all_turns())
         template = load_template()
         self.template = template._replace(
-            rows=cuda.to_device(template.rows), low=cuda.to_device(template.low),
-            centre_of_shape=cuda.to_device(template.centre_of_shape),
-        )  # fmt: skip
+            **{
+                name: cuda.to_device(part)
+                for name, part in template._asdict().items()
+                if isinstance(part, np.ndarray)
+            }
+        )
 
     def launch(self, search: Search, frames: int) -> None:
         """Start all fits of the first ``frames`` frames, whose peaks ``search`` has judged."""

@@ -51,7 +51,7 @@ _whole_vectors = on_device(residuals.whole_vectors, LANES=1)
 _in_registers = on_device(residuals.in_registers)
 _place = on_device(residuals.place, np=MATH)
 _corner = on_device(residuals.corner)
-_copy_row = on_device(residuals.copy_row)
+_short, _byte = on_device(residuals.short), on_device(residuals.byte)
 _off_middle = on_device(residuals.off_middle, np=MATH)
 _weigh = on_device(
     weigh,
@@ -60,16 +60,15 @@ _weigh = on_device(
     place_points=on_device(
         residuals.place_points, np=MATH, in_registers=_in_registers, corner=_corner, place=_place
     ),
-    look_up=on_device(residuals.look_up, np=MATH, copy_row=_copy_row),
+    look_up=on_device(residuals.look_up, np=MATH),
+    unpack=on_device(residuals.unpack, np=MATH, short=_short, byte=_byte),
     add_shape=on_device(residuals.add_shape, np=MATH, corner=_corner, off_middle=_off_middle),
     add_noise=on_device(residuals.add_noise, np=MATH, in_registers=_in_registers),
     clear=on_device(residuals.clear),
     place_rays=on_device(
         residuals.place_rays, np=MATH, in_registers=_in_registers, corner=_corner, place=_place
     ),
-    keep_crossing=on_device(
-        residuals.keep_crossing, np=MATH, copy_row=_copy_row, corner=_corner, off_middle=_off_middle
-    ),
+    keep_crossing=on_device(residuals.keep_crossing),
     weigh_columns=on_device(residuals.weigh_columns, np=MATH),
     differentiate=on_device(residuals.differentiate, np=MATH),
     sum_of=on_device(residuals.sum_of, LANES=1, load=load, add=add, total=total),
@@ -96,6 +95,13 @@ class Starts(NamedTuple):
     """(.., starts, STATE)"""
     told: Any
     """(.., starts, TOLD)"""
+
+
+class Scratch(NamedTuple):
+    """The working memory of each block: rows of (blocks, .., COLUMNS), see :func:`headvox.pose.residuals.weigh`."""
+
+    J: Any
+    words: Any
 
 
 @device
@@ -153,7 +159,7 @@ def accumulate(J, count, size, A, thread, threads):
 
 @device
 def linearise(
-    points, first, n, rays, m, modes, k, upright, template, state, J, A, told, costs, thread, threads
+    points, first, n, rays, m, modes, k, upright, template, state, J, words, A, told, costs, thread, threads
 ):
     """As :func:`headvox.pose.align.linearise`, by all threads of a block, of ``n`` points from the ``first`` on."""
     a, b = share_of(n, thread, threads)
@@ -161,7 +167,7 @@ def linearise(
     mine = J[:, a + c : b + d]
     cost, count = _weigh(
         points[:, first + a : first + b], b - a, _weight_of_each(n), rays[:, c:d], d - c, modes, k, True, template,
-        state, mine, told[thread],
+        state, mine, words[:, a + c : b + d], told[thread],
     )  # fmt: skip
     for i in range(PARAMETERS + 1):
         for s in range(count, b + d - a - c):
@@ -177,14 +183,15 @@ def linearise(
 
 @kernel
 def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, scratch, starts):
-    """Fit each start of each head: coarsely, but for the expected one, then to the end. ``scratch`` has a J a block."""
+    """Fit each start of each head: coarsely, but for the expected one, then to the end."""
     told = cuda.shared.array((MOST_THREADS, TOLD), np.float64)
     costs = cuda.shared.array((MOST_THREADS, 1), np.float64)
     A = cuda.shared.array((PARAMETERS, SYSTEM), np.float64)
     state = cuda.shared.array(STATE, np.float64)
     x = cuda.shared.array(PARAMETERS, np.float64)
     frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
-    J = scratch[frame * cuda.gridDim.x + cuda.blockIdx.x]
+    block = frame * cuda.gridDim.x + cuda.blockIdx.x
+    J, words = scratch.J[block], scratch.words[block]
     each = starts.costs.shape[1]
     heads = min(counts[frame, HEADS], MOST_POSES)
     for job in range(cuda.blockIdx.x, heads * each, cuda.gridDim.x):
@@ -211,7 +218,8 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
         for step in range(COARSE_STEPS + 1 if start > 0 and there > 1 else 0):
             cost = linearise(
                 points[at_head], FINE_SAMPLES, n_coarse, passing[at_head], 0, COARSE_MODES,
-                COARSE_K - min(step, COARSE_STEPS - 1), stands, template, state, J, A, told, costs, thread, threads,
+                COARSE_K - min(step, COARSE_STEPS - 1), stands, template, state, J, words, A, told, costs, thread,
+                threads,
             )  # fmt: skip
             if step < COARSE_STEPS:
                 factor(A, 7 + COARSE_MODES, thread, threads)
@@ -227,8 +235,8 @@ def fit_starts(counts, near, points, passing, turns, upright, anyhow, template, 
         for step in range(FINE_STEPS + 1):
             scale = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
             cost = linearise(
-                points[at_head], 0, n_fine, passing[at_head], m, FINE_MODES, scale, stands, template, state, J, A, told,
-                costs, thread, threads,
+                points[at_head], 0, n_fine, passing[at_head], m, FINE_MODES, scale, stands, template, state, J, words,
+                A, told, costs, thread, threads,
             )  # fmt: skip
             factor(A, 7 + FINE_MODES, thread, threads)
             if thread == 0:
@@ -320,7 +328,8 @@ def settle_heads(
     x = cuda.shared.array((6, PARAMETERS), np.float64)
     found = cuda.shared.array(2, np.int64)
     frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
-    J = scratch[frame * cuda.gridDim.x + cuda.blockIdx.x]
+    block = frame * cuda.gridDim.x + cuda.blockIdx.x
+    J, words = scratch.J[block], scratch.words[block]
     for head in range(cuda.blockIdx.x, min(counts[frame, HEADS], MOST_POSES), cuda.gridDim.x):
         i = frame * MOST_POSES + head
         centre, n, m = spheres[frame, heads[frame, head]], near[frame, head, SAMPLES], near[frame, head, RAYS]
@@ -343,7 +352,7 @@ def settle_heads(
             for step in range(POLISH_STEPS + 1):
                 linearise(
                     points[i], FINE_SAMPLES + COARSE_SAMPLES, more, passing[i, :, FINE_RAYS:], passes, MODES, LAST_K,
-                    stands, template, state, J, A, told, costs, thread, threads,
+                    stands, template, state, J, words, A, told, costs, thread, threads,
                 )  # fmt: skip
                 factor(A, PARAMETERS, thread, threads)
                 if thread == 0:

@@ -87,15 +87,15 @@ def add_prior_cost(cost, state, modes, upright):
 
 
 @bare_kernel
-def linearise(points, n, rays, m, modes, k, upright, steps, template, state, J, A, told):
+def linearise(points, n, rays, m, modes, k, upright, steps, template, state, J, words, A, told):
     """Return the cost of ``state``; write the normal equations to ``A`` (PARAMETERS, PARAMETERS + 1), if it ``steps``.
 
     The first ``n`` points and ``m`` rays count. ``modes`` are fitted, ``k`` is the scale of rho, ``upright`` says
-    whether the priors on pitch and roll hold. ``J`` is scrap; for ``told`` see :func:`weigh`.
+    whether the priors on pitch and roll hold. ``J`` and ``words`` are scrap; for ``told`` see :func:`weigh`.
     """
     size = 7 + modes
     each = weight_of_each(n)
-    cost, count = weigh(points, n, each, rays, m, modes, k, steps, template, state, J, told)
+    cost, count = weigh(points, n, each, rays, m, modes, k, steps, template, state, J, words, told)
     cost = add_prior_cost(cost, state, modes, upright)
     if steps:
         _accumulate(J, count, size, A)

@@ -2,7 +2,7 @@
 
 A column begins as a place in the template, becomes what the template says there, and ends as the derivatives of its
 residual, times the root of its weight. Every step is a loop of its own over all columns, which the compiler makes
-vectors of; only the look-ups in the template go one by one.
+vectors of; only what brings a voxel's words from memory goes column by column.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from headvox.machine.kernels import bare_kernel, rule
 from headvox.machine.simd import LANES, add, load, total
-from headvox.pose.template import MODES
+from headvox.pose.template import DISTANCE_AT, GRADIENT_AT, MODES, MODES_AT, SIGMA_AT
 
 PARAMETERS = 7 + MODES  # a shift and a turn in the head's axes, log scale, modes
 RESIDUAL = PARAMETERS  # the row of the Jacobian that belongs to the residual
@@ -39,21 +39,26 @@ def weight_of_each(n):
 
 
 @rule
-def weigh(points, n, each, rays, m, modes, k, steps, template, state, J, told):
+def weigh(points, n, each, rays, m, modes, k, steps, template, state, J, words, told):
     """Return twice what the first ``n`` points and ``m`` rays cost in ``state``, and how many columns they have.
 
     ``each`` point has this weight. ``J`` (ROWS, columns) receives the derivatives, if it ``steps``: points that would
-    not move the fit have columns of zeros, and rays that cross nothing have none. ``told`` receives what the points
-    cost with a weight of 1 and whatever way they face, how many lie on the surface, and how many rays cross it.
+    not move the fit have columns of zeros, and rays that cross nothing have none. ``words`` (WORDS, columns) is scrap.
+    ``told`` receives what the points cost with a weight of 1 and whatever way they face, how many lie on the surface,
+    and how many rays cross it.
     """
     voxel_m, scale, behind = template.voxel_m, np.exp(state[12]), whole_vectors(n)
     place_points(points, n, state, template, J)
-    outside = look_up(n, modes, template.rows, J)
-    add_shape(n, state, modes, template, J)
+    outside = look_up(0, n, modes, template, J, words)
+    unpack(0, n, modes, template, words, J)
+    add_shape(0, n, state, modes, template, J)
     add_noise(points, n, state, J)
     clear(n, behind, modes, J)
     place_rays(rays, m, behind, state, template, J)
-    crossed = keep_crossing(behind, m, state, modes, template, J)
+    look_up(behind, behind + m, modes, template, J, words)
+    unpack(behind, behind + m, modes, template, words, J)
+    add_shape(behind, behind + m, state, modes, template, J)
+    crossed = keep_crossing(behind, m, modes, J)
     after = whole_vectors(behind + crossed)
     clear(behind + crossed, after, modes, J)
     on = weigh_columns(0, n, each, k, scale, J) - outside
@@ -90,7 +95,7 @@ def corner(template):
 
 @rule
 def place(px, py, pz, s, state, low, template, J):
-    """Write to column ``s`` where px, py, pz (m, from the head's centre) lie, in voxels, and in which; -1: in none."""
+    """Write to column ``s`` where px, py, pz (m, from the head's centre) lie, in voxels, and in which."""
     shrink, shape = 1.0 / (np.exp(state[12]) * template.voxel_m), template.shape
     x = (state[3] * px + state[6] * py + state[9] * pz) * shrink
     y = (state[4] * px + state[7] * py + state[10] * pz) * shrink
@@ -98,7 +103,8 @@ def place(px, py, pz, s, state, low, template, J):
     fx, fy, fz = np.floor(x - low[0]), np.floor(y - low[1]), np.floor(z - low[2])
     inside = (fx >= 0.0) & (fy >= 0.0) & (fz >= 0.0) & (fx < shape[0]) & (fy < shape[1]) & (fz < shape[2])
     J[X, s], J[Y, s], J[Z, s] = x, y, z
-    J[VOXEL, s] = (fx * shape[1] + fy) * shape[2] + fz if inside else -1.0
+    outside = float(shape[0] * shape[1] * shape[2])
+    J[VOXEL, s] = (fx * shape[1] + fy) * shape[2] + fz if inside else outside
 
 
 @bare_kernel
@@ -122,30 +128,45 @@ def place_rays(rays, m, first, state, template, J):
         place(px, py, pz, np.uint64(first) + k, state, low, template, J)
 
 
+@bare_kernel
+def look_up(first, after, modes, template, J, words):
+    """Bring what the template says of columns ``first`` to ``after``; return how many of them lie outside of it."""
+    used, outside, nowhere = 2 + (MODES_AT + modes - 1) // 8, 0, template.voxels.shape[0] - 1
+    for s in range(np.uint64(first), np.uint64(after)):
+        at = np.uint64(J[VOXEL, s])
+        for word in range(np.uint64(used)):
+            words[word, s] = template.voxels[at, word]
+        outside += at == nowhere
+    return outside
+
+
 @rule
-def copy_row(row, modes, J, s):
-    """Write what a ``row`` of the template says to column ``s``."""
-    J[DISTANCE, s], J[SIGMA, s] = row[0], row[4]
-    J[0, s], J[1, s], J[2, s] = row[1], row[2], row[3]
-    for i in range(modes):
-        J[7 + i, s] = row[5 + i]
+def short(word, at):
+    """Return one of the four numbers of 16 bits in a ``word``."""
+    return float(word << (48 - 16 * at) >> 48)
+
+
+@rule
+def byte(word, at):
+    """Return one of the eight numbers of 8 bits in a ``word``."""
+    return float(word << (56 - 8 * at) >> 56)
 
 
 @bare_kernel
-def look_up(n, modes, rows, J):
-    """Write what the template says of the first ``n`` columns; zeros where it ends, and return of how many it does."""
-    outside = 0
-    for s in range(n):
-        at = np.int64(J[VOXEL, s])
-        if at >= 0:
-            copy_row(rows[at], modes, J, s)
-            continue
-        outside += 1
-        J[DISTANCE, s], J[SIGMA, s] = 0.0, 1.0
-        J[0, s], J[1, s], J[2, s] = 0.0, 0.0, 0.0
-        for i in range(modes):
-            J[7 + i, s] = 0.0
-    return outside
+def unpack(first, after, modes, template, words, J):
+    """Write what the template says, in metres, of columns ``first`` to ``after``, whose ``words`` these are."""
+    distance, gradient, sigma = template.distance_unit_m, template.gradient_unit, template.sigma_unit_m
+    for s in range(np.uint64(first), np.uint64(after)):
+        word = words[0, s]
+        J[DISTANCE, s] = distance * short(word, DISTANCE_AT)
+        J[0, s] = gradient * short(word, GRADIENT_AT)
+        J[1, s] = gradient * short(word, GRADIENT_AT + 1)
+        J[2, s] = gradient * short(word, GRADIENT_AT + 2)
+        J[SIGMA, s] = sigma * byte(words[1, s], SIGMA_AT)
+    for i in range(modes):
+        unit, at = template.mode_units_m[i], MODES_AT + i
+        for s in range(np.uint64(first), np.uint64(after)):
+            J[7 + i, s] = unit * byte(words[1 + at // 8, s], at % 8)
 
 
 @rule
@@ -155,38 +176,32 @@ def off_middle(x, low):
 
 
 @bare_kernel
-def add_shape(n, state, modes, template, J):
-    """Add to the distances of ``n`` columns what their place in the voxel makes of it, and the modes of shape."""
+def add_shape(first, after, state, modes, template, J):
+    """Add to the distances of columns what their place in the voxel makes of it, and the modes of shape."""
     (lx, ly, lz), voxel_m = corner(template), template.voxel_m
-    for s in range(np.uint64(n)):
+    for s in range(np.uint64(first), np.uint64(after)):
         ax, ay, az = off_middle(J[X, s], lx), off_middle(J[Y, s], ly), off_middle(J[Z, s], lz)
         J[DISTANCE, s] += voxel_m * (J[0, s] * ax + J[1, s] * ay + J[2, s] * az)
     for i in range(modes):
         much = state[13 + i]
-        for s in range(np.uint64(n)):
+        for s in range(np.uint64(first), np.uint64(after)):
             J[DISTANCE, s] += much * J[7 + i, s]
 
 
 @bare_kernel
-def keep_crossing(first, m, state, modes, template, J):
+def keep_crossing(first, m, modes, J):
     """Keep those of ``m`` columns from ``first`` on that cross the template, side by side; return how many do."""
-    (lx, ly, lz), voxel_m, crossed = corner(template), template.voxel_m, 0
+    kept = first
     for s in range(first, first + m):
-        at = np.int64(J[VOXEL, s])
-        if at < 0:
-            continue
-        row, x, y, z = template.rows[at], J[X, s], J[Y, s], J[Z, s]
-        ax, ay, az = off_middle(x, lx), off_middle(y, ly), off_middle(z, lz)
-        distance = row[0] + voxel_m * (row[1] * ax + row[2] * ay + row[3] * az)
-        for i in range(modes):
-            distance += state[13 + i] * row[5 + i]
-        if distance < 0.0:
-            kept = first + crossed
-            copy_row(row, modes, J, kept)
-            J[X, kept], J[Y, kept], J[Z, kept], J[DISTANCE, kept] = x, y, z, distance
+        if J[DISTANCE, s] < 0.0:
+            for i in range(3):
+                J[i, kept], J[X + i, kept] = J[i, s], J[X + i, s]
+            for i in range(modes):
+                J[7 + i, kept] = J[7 + i, s]
+            J[DISTANCE, kept], J[SIGMA, kept] = J[DISTANCE, s], J[SIGMA, s]
             J[NOISE, kept], J[HIDDEN, kept] = 0.0, 0.0
-            crossed += 1
-    return crossed
+            kept += 1
+    return kept - first
 
 
 @bare_kernel

@@ -18,13 +18,13 @@ from headvox.machine.threads import take
 from headvox.pose.align import invert, linearise, move, solve
 from headvox.pose.nearby import MOST_SAMPLES, RAY, SAMPLE
 from headvox.pose.residuals import COST, EVIDENCE, PARAMETERS, ROWS, STATE, TOLD
-from headvox.pose.template import FINE_MODES, LINE, MODES
+from headvox.pose.template import FINE_MODES, LINE, MODES, WORDS
 
 COARSE_STEPS, FINE_STEPS, POLISH_STEPS = 4, 5, 2
 COARSE_SAMPLES, FINE_SAMPLES, POLISH_SAMPLES = 120, 240, 400
 FINE_RAYS, POLISH_RAYS = 120, 400
 # Of a row of the Jacobian: all points and all rays in whole vectors, and an odd number of lines of the cache.
-ROOM = LANES * (-(-POLISH_SAMPLES // LANES) - (-POLISH_RAYS // LANES)) + LINE // 2
+ROOM = LANES * (-(-POLISH_SAMPLES // LANES) - (-POLISH_RAYS // LANES)) + LINE
 COARSE_MODES = 0
 # Of the first coarse step (1 less each step), the first and the last fine one.
 COARSE_K, FINE_K, LAST_K = 4.0, 4.0, 2.5
@@ -51,6 +51,8 @@ class Scratch(NamedTuple):
     """(SAMPLE, COARSE_SAMPLES) those of the samples that all starts are tried on"""
     J: F64
     """(ROWS, ROOM) the Jacobian, a column a point, and what leads to it"""
+    words: I64
+    """(WORDS, ROOM) what the template says of these columns, and"""
     A: F64
     """(PARAMETERS, PARAMETERS + 1) the normal equations"""
     x: F64
@@ -67,8 +69,8 @@ class Scratch(NamedTuple):
         """Return the memory for one thread, all zeros."""
         return cls(
             np.zeros((MOST_SAMPLES, SAMPLE)), np.zeros((MOST_SAMPLES, RAY)), np.zeros((SAMPLE, COARSE_SAMPLES)),
-            np.zeros((ROWS, ROOM)), np.zeros((PARAMETERS, PARAMETERS + 1)), np.zeros(PARAMETERS),
-            np.zeros(MOST_STARTS), np.zeros((MOST_STARTS, STATE)), np.zeros(TOLD),
+            np.zeros((ROWS, ROOM)), np.zeros((WORDS, ROOM), np.int64), np.zeros((PARAMETERS, PARAMETERS + 1)),
+            np.zeros(PARAMETERS), np.zeros(MOST_STARTS), np.zeros((MOST_STARTS, STATE)), np.zeros(TOLD),
         )  # fmt: skip
 
 
@@ -213,7 +215,7 @@ def explore(work, used, rays, starts, upright, template):
         for step in range(COARSE_STEPS + 1):
             k, steps = COARSE_K - min(step, COARSE_STEPS - 1), step < COARSE_STEPS
             work.costs[i] = linearise(
-                work.points, used, rays, none, modes, k, upright, steps, template, state, work.J, A,
+                work.points, used, rays, none, modes, k, upright, steps, template, state, work.J, work.words, A,
                 work.told,
             )  # fmt: skip
             if steps:
@@ -295,7 +297,7 @@ def refine(work, trials, i, at, template):
         k = FINE_K + (LAST_K - FINE_K) * min(step, FINE_STEPS - 1) / (FINE_STEPS - 1)
         cost = linearise(
             trials.points[i], counts[POINTS], trials.passing[i], counts[RAYS], modes, k, counts[STANDS] != 0, always,
-            template, state, work.J, A, told,
+            template, state, work.J, work.words, A, told,
         )  # fmt: skip
         solve(A, x, 7 + modes)
         if step < FINE_STEPS:
@@ -324,7 +326,7 @@ def polish(work, trials, i, at, template):
     for step in range(POLISH_STEPS + 1):
         linearise(
             trials.more_points[i], counts[MORE_POINTS], trials.more_passing[i], counts[MORE_RAYS], modes, LAST_K,
-            counts[STANDS] != 0, always, template, state, work.J, A, told,
+            counts[STANDS] != 0, always, template, state, work.J, work.words, A, told,
         )  # fmt: skip
         solve(A, x, PARAMETERS)
         if step < POLISH_STEPS:

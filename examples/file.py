@@ -12,16 +12,17 @@ from pathlib import Path
 import headvox
 
 
+def tell(reason: str) -> None:
+    """Say why a frame is skipped."""
+    print(f"skipped: {reason}", file=sys.stderr)
+
+
 def main(place: str | Path) -> None:
     """Print a line for each head that is followed, frame by frame."""
     detector, tracker = headvox.Detector(), headvox.Tracker()
     with closing(headvox.open_source(place)) as source, closing(detector):
-        for frame in source:
-            if isinstance(frame, headvox.BadFrame):
-                print(f"skipped: {frame.reason}", file=sys.stderr)
-                continue
-            heads = detector.detect_frame(frame, tracker.expected(frame.stamp_ns))
-            for track in tracker.update(heads, frame):
+        for frame, tracks in headvox.follow(source, detector, tracker, on_bad=tell):
+            for track in tracks:
                 if track.id:  # 0 until it was seen often enough to be believed
                     x, y, z = track.centre
                     print(f"{frame.stamp_ns / 1e9:.3f} s  head {track.id}  {x:+.3f} {y:+.3f} {z:+.3f} m")

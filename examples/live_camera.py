@@ -17,16 +17,15 @@ from headvox.sources.options import SourceOptions, mount
 WHERE = SourceOptions(T_world_mount=mount(x=0.0, y=0.0, z=1.65, roll_deg=0.0, pitch_deg=10.0, yaw_deg=0.0))
 
 
-def follow(frames: Iterable[headvox.Frame | headvox.BadFrame]) -> None:
+def tell(reason: str) -> None:
+    """Say why a frame is skipped: a hand before the lens, say."""
+    print(f"skipped: {reason}", file=sys.stderr)
+
+
+def main(frames: Iterable[headvox.Frame | headvox.BadFrame]) -> None:
     """Print how many people are there, how far the nearest head is, and what the frame took."""
     with closing(headvox.Detector()) as detector:
-        tracker = headvox.Tracker()
-        for frame in frames:
-            if isinstance(frame, headvox.BadFrame):
-                print(f"skipped: {frame.reason}", file=sys.stderr)
-                continue
-            heads = detector.detect_frame(frame, tracker.expected(frame.stamp_ns))
-            tracks = tracker.update(heads, frame)
+        for frame, tracks in headvox.follow(frames, detector, headvox.Tracker(), on_bad=tell):
             camera = frame.depths[0].T_world_camera[:3, 3]
             away = [float(((track.centre - camera) ** 2).sum() ** 0.5) for track in tracks if track.id]
             nearest = f"nearest {min(away):.2f} m" if away else "nobody"
@@ -40,6 +39,6 @@ if __name__ == "__main__":
             closing(headvox.open_source(f"realsense:{serial}", WHERE)) as camera,
             suppress(KeyboardInterrupt),
         ):
-            follow(camera)
+            main(camera)
     except headvox.HeadvoxError as error:
         sys.exit(str(error))

@@ -35,11 +35,7 @@ def main(place: str | Path) -> None:
     """Print what the robot should do, for each frame."""
     detector, tracker = headvox.Detector(), headvox.Tracker()
     with closing(headvox.open_source(place)) as source, closing(detector):
-        for frame in source:
-            if isinstance(frame, headvox.BadFrame):
-                print("stop: nothing was seen")
-                continue
-            tracker.update(detector.detect_frame(frame, tracker.expected(frame.stamp_ns)), frame)
+        for frame, _ in headvox.follow(source, detector, tracker, lambda why: print(f"stop: {why}")):
             soon = tracker.predict(frame.stamp_ns + round(1e9 * REACT_S))  # where they are when it brakes
             margins = [np.inf]
             for head, covariance in zip(soon, soon.covariances[:, :3, :3], strict=True):  # without an id, too

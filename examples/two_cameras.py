@@ -25,7 +25,11 @@ def main(place: str | Path) -> None:
                 continue
             alone = {image.name: headvox.Frame(frame.stamp_ns, depths=(image,)) for image in frame.depths}
             for name, seen in {**alone, "together": frame}.items():
-                heads = detector.detect_frame(seen)
+                try:
+                    heads = detector.detect_frame(seen)
+                except headvox.HeadvoxError as error:
+                    print(f"skipped: {error}", file=sys.stderr)
+                    continue
                 counts[name][0] += len(heads)
                 counts[name][1] += sum(head.quaternion[0] == head.quaternion[0] for head in heads)  # not NaN
     for name, (found, oriented) in counts.items():

@@ -6,6 +6,7 @@ import re
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -91,11 +92,16 @@ def test_the_protective_distance_is_what_the_parts_add_up_to() -> None:
 
 
 def test_a_live_camera_by_what_it_would_send(capsys: pytest.CaptureFixture[str]) -> None:
-    bad = headvox.BadFrame(0, "the cable")
-    loaded("live_camera").follow([bad, *headvox.open_source(headvox.sample_folder())])
+    frames = list(headvox.open_source(headvox.sample_folder()))
+    assert isinstance(frames[0], headvox.Frame)
+    dark = [replace(image, depth=np.zeros_like(image.depth)) for image in frames[0].depths]
+    bad = headvox.BadFrame(0, "the cable"), replace(frames[0], depths=tuple(dark))
+    loaded("live_camera").main([*bad, *frames])
     out, err = capsys.readouterr()
     lines = out.splitlines()
-    assert err == "skipped: the cable\n"
+    told = err.splitlines()
+    assert told[0] == "skipped: the cable"
+    assert told[1].startswith("skipped: left: the depth image has no return at all.")
     assert len(lines) == 24
     assert lines[0].startswith("0 heads, nobody, ")
     assert re.match(r"[34] heads, nearest [12]\.\d\d m, ", lines[-1])

@@ -9,9 +9,10 @@ import pytest
 
 from headvox.data import BadFrame, Expected, Frame, Heads
 from headvox.errors import HeadvoxError
-from headvox.run import Report, run
+from headvox.run import Report, follow, run
 from headvox.sinks import Result
 from headvox.sinks.summary import summary
+from headvox.tracking.tracker import Tracker
 
 HEADS = Heads(np.zeros((2, 3)), np.full((2, 4), np.nan), np.full(2, 0.1), np.array([2.0, 1.0]))
 
@@ -112,3 +113,52 @@ def test_the_summary_of_a_run_without_good_frames_has_no_times() -> None:
     assert "ms a frame" not in summary(Report(interrupted=True))
     assert summary(run(ListSource(Frame(0)), TwoHeads())).startswith("head ")
     assert summary(run(ListSource(Frame(0), Frame(1)), TwoHeads())).startswith("frames ")
+
+
+def times(told: list[str], *stamps: int) -> list[int]:
+    """The stamps of the frames that are followed; those before 0 cannot be used."""
+    frames = [BadFrame(0, "cut off") if stamp == 7 else Frame(stamp) for stamp in stamps]
+    return [frame.stamp_ns for frame, _ in follow(frames, TwoHeads(), Tracker(), told.append)]
+
+
+def test_to_follow_skips_what_cannot_be_used_and_says_why() -> None:
+    told: list[str] = []
+    assert times(told, 10, -1, 20, 7, 30) == [10, 20, 30]
+    assert told == ["Before time. Wait.", "cut off"]
+    with pytest.warns(RuntimeWarning, match=r"headvox: a frame is skipped: Before time\. Wait\."):
+        assert len(list(follow([Frame(0), Frame(-1)], TwoHeads(), Tracker()))) == 1
+
+
+def test_to_follow_tells_where_heads_are_expected() -> None:
+    expected: list[int] = []
+
+    class Asked(TwoHeads):
+        def detect_frame(self, frame: Frame, expected_: Expected | None = None) -> Heads:
+            expected.append(0 if expected_ is None else len(expected_))
+            return HEADS
+
+    frames = [Frame(k * 33_000_000) for k in range(12)]
+    ids = [[track.id for track in tracks] for _, tracks in follow(frames, Asked(), Tracker())]
+    assert (ids[0], expected[0]) == ([0, 0], 0)
+    assert (ids[-1], expected[-1]) == ([1, 2], 2)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "says"),
+    [
+        ((), "there is no frame to follow"),
+        ((-1, -2), "none of 2 frames could be used; the last: Before time"),
+    ],
+)
+def test_to_follow_what_cannot_be_used_at_all_is_an_error(stamps: tuple[int, ...], says: str) -> None:
+    with pytest.raises(HeadvoxError, match=says):
+        times([], *stamps)
+
+
+def test_what_the_caller_raises_is_his() -> None:
+    told: list[str] = []
+    following = follow([Frame(0), Frame(1)], TwoHeads(), Tracker(), told.append)
+    next(following)
+    with pytest.raises(HeadvoxError, match="mine"):
+        following.throw(HeadvoxError("mine"))  # type: ignore[attr-defined]
+    assert told == []

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from headvox.data import Intrinsics as Intrinsics
     from headvox.errors import HeadvoxError as HeadvoxError
     from headvox.pipeline import Detector as Detector
+    from headvox.run import follow as follow
     from headvox.sample import sample_folder as sample_folder
     from headvox.sources import open_source as open_source
     from headvox.tracking.tracker import Tracker as Tracker
@@ -37,6 +38,7 @@ _HOME = {
     "Intrinsics": "headvox.data",
     "Tracker": "headvox.tracking.tracker",
     "TrackerConfig": "headvox.config",
+    "follow": "headvox.run",
     "open_source": "headvox.sources",
     "sample_folder": "headvox.sample",
 }

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Protocol
 
-from headvox.data import BadFrame, Expected, Frame, Heads
+from headvox.data import BadFrame, Expected, Frame, Heads, Tracks
 from headvox.errors import HeadvoxError
 from headvox.sinks import Result, Sink
 from headvox.sources import Source
@@ -130,6 +131,43 @@ def run(
         return report
     check_any(source, report.frames, report.bad)
     return report
+
+
+def follow(
+    frames: Iterable[Frame | BadFrame],
+    detector: FrameDetector,
+    tracker: Tracker,
+    on_bad: Callable[[str], None] | None = None,
+) -> Iterator[tuple[Frame, Tracks]]:
+    """Yield each of ``frames`` with the heads that are followed in it: for programs of one's own.
+
+    A frame that cannot be read or used, such as an image without any return, is told to ``on_bad`` (the reason), by
+    default as a Python warning, and skipped. Heads that were not seen often enough yet have the id 0.
+
+    Raises:
+        HeadvoxError: at the end, where there was no frame, or none that could be used.
+    """
+    tell, good, bad, why = on_bad or _warn, 0, 0, ""
+    for frame in frames:
+        try:
+            if isinstance(frame, BadFrame):
+                raise HeadvoxError(frame.reason)
+            heads = detector.detect_frame(frame, tracker.expected(frame.stamp_ns))
+        except HeadvoxError as error:
+            bad, why = bad + 1, str(error)
+            tell(why)
+            continue
+        good += 1
+        yield frame, tracker.update(heads, frame)
+    if good == 0:
+        what = (
+            f"none of {bad} frames could be used; the last: {why}" if bad else "there is no frame to follow."
+        )
+        raise HeadvoxError(what, "" if bad else "Check how it was recorded.")
+
+
+def _warn(reason: str) -> None:
+    warnings.warn(f"headvox: a frame is skipped: {reason}", RuntimeWarning, stacklevel=3)
 
 
 def check_any(source: Source, frames: int, bad: int) -> None:

@@ -40,12 +40,13 @@ from headvox.cuda import (
 )
 from headvox.gate import gate_tables, pass_gate
 from headvox.integral import integral_volume
+from headvox.lattice import Lattice
 from headvox.masks.compile import compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade
 from headvox.suppress import suppress as suppress_on_cpu
 from headvox.visibility import cells_of, count_seen
 from headvox.vote import DROPPED, score_by_stages, seen_boxes
-from headvox.voxelize import Lattice, Rays, voxelize_depth, voxelize_points
+from headvox.voxelize import Rays, voxelize_depth, voxelize_points
 
 # The simulator computes as NumPy's scalars do, which tell of what the hardware does silently.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore:Grid size")

@@ -32,6 +32,7 @@ from headvox.cuda import (
 from headvox.cuda.device import is_simulated
 from headvox.cuda.fits import Fits
 from headvox.data import Expected
+from headvox.lattice import Lattice
 from headvox.machine.cholesky import half_log_determinant
 from headvox.machine.threads import Threads
 from headvox.pose import align, residuals, trials
@@ -41,7 +42,7 @@ from headvox.pose.fit import Poses
 from headvox.pose.nearby import gather_points, sensors_of
 from headvox.refine import COUNT, HAIR_M, MOST_PARTS, RADIUS, ROWS, fit_spheres
 from headvox.suppress import suppress_overlaps
-from headvox.voxelize import Lattice, Rays
+from headvox.voxelize import Rays
 
 # The simulator computes as NumPy's scalars do, which tell of what the hardware does silently.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore:Grid size")

@@ -30,8 +30,8 @@ from headvox.cuda import (
 from headvox.cuda.device import BATCH, check_device, is_simulated
 from headvox.data import Expected
 from headvox.fuse import Region
+from headvox.lattice import Lattice
 from headvox.masks.compile import compile_cascade
-from headvox.voxelize import Lattice
 
 # The simulator computes as NumPy's scalars do, which tell of what the hardware does silently.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore:Grid size")

@@ -20,10 +20,10 @@ from numba import cuda
 from numba.cuda import dispatcher
 
 from headvox.data import Cloud, Frame
+from headvox.lattice import Lattice
 from headvox.masks.compile import compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade
 from headvox.suppress import AROUND
-from headvox.voxelize import Lattice
 
 KERNELS = 23
 MOST_THREADS, REGISTERS = 256, 1 << 16  # of a block

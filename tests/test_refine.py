@@ -4,8 +4,9 @@ import pytest
 import scenes
 
 from headvox.data import Cloud
+from headvox.lattice import Lattice
 from headvox.refine import MOST_PARTS, ROWS, fit_spheres
-from headvox.voxelize import Lattice, voxelize_points
+from headvox.voxelize import voxelize_points
 
 
 def fitted(cells, peaks, voxel=0.05, subdivision=2, counting=False):

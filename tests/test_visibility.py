@@ -5,8 +5,8 @@ import pytest
 import scenes
 
 from headvox.data import DepthImage, Intrinsics
+from headvox.lattice import Lattice
 from headvox.visibility import BEHIND, NO_RETURN, OUT_OF_VIEW, SEEN_EMPTY, SURFACE, count_seen, see_places
-from headvox.voxelize import Lattice
 
 REGION = scenes.region(0.6, -0.3, 0.5)
 BOXES = np.array(

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from headvox.data import Cloud, DepthImage, Intrinsics
 from headvox.errors import HeadvoxError
 from headvox.fuse import Region
+from headvox.lattice import Lattice
 from headvox.machine.threads import new_blocks
 from headvox.voxelize import (
     ROWS,
-    Lattice,
     Marking,
     Rays,
     mark_depth,

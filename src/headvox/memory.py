@@ -13,6 +13,7 @@ from headvox.assemble import MOST_POSES
 from headvox.data import F64, I32, I64
 from headvox.gate import candidate_reach, gate_tables, shape_of_passed
 from headvox.integral import box_reach, room_for, row_for, shape_with_margins
+from headvox.lattice import Lattice
 from headvox.machine.simd import LANES
 from headvox.masks.compile import CompiledCascade, CompiledStages
 from headvox.pose.fit import FitMemory
@@ -20,7 +21,7 @@ from headvox.refine import MOST_PARTS, ROWS
 from headvox.slabs import Slabs, cut
 from headvox.visibility import as_columns, cells_of
 from headvox.vote import StageTables, seen_boxes
-from headvox.voxelize import Lattice, Marking
+from headvox.voxelize import Marking
 
 
 class Memory:

@@ -10,9 +10,10 @@ from headvox.check import origins_of
 from headvox.config import DetectorConfig
 from headvox.data import F32, F64, Cloud, DepthImage, Frame, Intrinsics
 from headvox.fuse import Region
+from headvox.lattice import Lattice
 from headvox.masks.compile import CompiledCascade
 from headvox.visibility import camera_table
-from headvox.voxelize import Lattice, Rays, part_transform
+from headvox.voxelize import Rays, part_transform
 
 AHEAD_M, AHEAD_SHARE = 2.0, 0.4
 """How far before a sensor heads are plainly expected, metres; in a small region, as a share of its radius."""

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from headvox.data import F32, F64, I32, DepthImage, Intrinsics
 from headvox.frames import inverse
+from headvox.lattice import Lattice
 from headvox.machine.kernels import bare_kernel, kernel, product, read_only, rule
-from headvox.voxelize import Lattice
 
 HIDDEN, EMPTY = 1, 2
 NEAREST_M = 0.1  # a cell closer to the camera than this projects to nowhere useful

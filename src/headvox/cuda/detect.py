@@ -11,6 +11,7 @@ from headvox.cuda.device import Device
 from headvox.cuda.readings import Asked, Found
 from headvox.data import Expected, Frame, Heads
 from headvox.keep import asks_cameras, least_before, least_score, slack_of
+from headvox.lattice import Lattice
 from headvox.machine.clock import Clock
 from headvox.machine.threads import Threads
 from headvox.masks.compile import CompiledCascade
@@ -19,7 +20,6 @@ from headvox.placing import Placing
 from headvox.relief import look_again
 from headvox.suppress import AROUND, MOST_PEAKS
 from headvox.verify import verify
-from headvox.voxelize import Lattice
 
 DEVICE_STAGES = ("device", "host")
 """On a GPU all is one stage, from the upload to the download; what is left to the host is to make heads of it."""

@@ -13,8 +13,9 @@ import numpy.typing as npt
 from headvox.cuda.readings import Asked, Found
 from headvox.data import DepthImage
 from headvox.errors import HeadvoxError, MissingExtra
+from headvox.lattice import Lattice
 from headvox.masks.compile import CompiledCascade
-from headvox.voxelize import Lattice, Rays
+from headvox.voxelize import Rays
 
 if TYPE_CHECKING:
     from headvox.cuda.search import Search

@@ -24,10 +24,11 @@ import numpy.typing as npt
 
 from headvox.check import origins_of
 from headvox.data import F64, I32, I64, DepthImage, Expected, Frame
+from headvox.lattice import Lattice
 from headvox.pose.fit import Poses
 from headvox.pose.nearby import lens_of
 from headvox.visibility import camera_table
-from headvox.voxelize import Lattice, Rays, part_transform
+from headvox.voxelize import Rays, part_transform
 
 SENSORS, SEES, ODD, THRESHOLD, LIMITS, LEAST, EXPECTED, EXPECTED_AT, HAIRED = 0, 1, 2, 5, 8, 14, 16, 17, 18
 ORIGIN = 10  # in float64

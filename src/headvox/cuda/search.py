@@ -23,11 +23,12 @@ from headvox.cuda.lanes import SIMULATED
 from headvox.cuda.readings import OCTET, Asked, Found, pack, words_of
 from headvox.data import I32, I64, DepthImage
 from headvox.gate import gate_tables
+from headvox.lattice import Lattice
 from headvox.masks.compile import CompiledCascade, CompiledStages
 from headvox.suppress import PEAK_REACH
 from headvox.visibility import cells_of
 from headvox.vote import seen_boxes
-from headvox.voxelize import Lattice, Rays
+from headvox.voxelize import Rays
 
 # The simulator runs every thread in turn: a few of each kind are enough to show what goes wrong between them.
 THREADS = 2 if SIMULATED else 128

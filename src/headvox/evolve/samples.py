@@ -21,12 +21,13 @@ from headvox.evolve.views import View
 from headvox.fuse import Region
 from headvox.gate import pass_gate
 from headvox.integral import integral_volume
+from headvox.lattice import Lattice
 from headvox.masks.cascade import CHANNELS
 from headvox.masks.compile import SCORE_UNIT, CompiledGate, CompiledStages
 from headvox.suppress import PEAK_REACH, suppress
 from headvox.visibility import count_seen
 from headvox.vote import DROPPED, score_by_stages
-from headvox.voxelize import Lattice, voxelize_depth, voxelize_points
+from headvox.voxelize import voxelize_depth, voxelize_points
 
 RANGE_M = 5.0
 EDGE_M = 0.2  # heads so near to the end of the range are cut by it

@@ -235,6 +235,10 @@ def test_bad_lines_are_told(
         ('{"stamp_ns": 0, "heads": [{"centre": [0, 0, 0], "posture": 3}]}', "a word under 'posture'"),
         ('{"stamp_ns": 0, "heads": [], "exhaustive": false}', "no frame has labels"),
         ('{"stamp_ns": 7, "heads": []}', "no frame has labels"),
+        (
+            '{"stamp_ns": 0, "heads": [], "exhaustive": false}\n{"stamp_ns": 0, "heads": []}',
+            "line 2: a second line",
+        ),
     ],
 )
 def test_bad_truth_is_told(

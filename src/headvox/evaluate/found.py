@@ -10,7 +10,7 @@ import numpy as np
 
 from headvox.data import F64, I64
 from headvox.errors import HeadvoxError
-from headvox.evaluate.truth import NO_ID, frame_heads, numbers, quaternion, read_lines, stamp_of
+from headvox.evaluate.truth import NO_ID, frame_heads, numbers, quaternion, stamped_lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,8 @@ def read_found(path: Path) -> dict[int, FoundHeads]:
     """
     numbered: dict[object, int] = {}
     found: dict[int, FoundHeads] = {}
-    for name, line in read_lines(path):
-        heads, stamp_ns = frame_heads(line, name), stamp_of(line, name)
-        if stamp_ns in found:
-            raise HeadvoxError(
-                f"{name}: a second line of the stamp {stamp_ns}.", "Put a frame's heads on one line."
-            )
+    for name, stamp_ns, line in stamped_lines(path):
+        heads = frame_heads(line, name)
         ids = [head.get("id") for head in heads]
         if not all(value is None or isinstance(value, (int, str)) for value in ids):
             raise HeadvoxError(f"{name}: expected a number, a word or null under 'id'.", "Correct it.")

@@ -83,14 +83,26 @@ def read_truth(path: Path) -> dict[int, TrueHeads]:
     """Return the heads of every frame whose heads are all known, by its stamp.
 
     Raises:
-        HeadvoxError: no such file, or a line that is not as docs/conventions.md has it.
+        HeadvoxError: no such file, a line that is not as docs/conventions.md has it, or two lines of one stamp.
     """
     truth: dict[int, TrueHeads] = {}
-    for name, line in read_lines(path):
+    for name, stamp_ns, line in stamped_lines(path):
         heads = frame_heads(line, name)
         if line.get("exhaustive", True) is True:
-            truth[stamp_of(line, name)] = TrueHeads.of(line["stamp_ns"], heads, name)
+            truth[stamp_ns] = TrueHeads.of(stamp_ns, heads, name)
     return truth
+
+
+def stamped_lines(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    """Yield what :func:`read_lines` does, with the stamp that each line has and no other."""
+    known: set[int] = set()
+    for name, line in read_lines(path):
+        stamp_ns = stamp_of(line, name)
+        if stamp_ns in known:
+            what = f"{name}: a second line of the stamp {stamp_ns}."
+            raise HeadvoxError(what, "Put a frame's heads on one line.")
+        known.add(stamp_ns)
+        yield name, stamp_ns, line
 
 
 def read_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -21,7 +21,7 @@ from headvox.pose.residuals import COST, EVIDENCE, PARAMETERS, ROWS, STATE, TOLD
 from headvox.pose.template import FINE_MODES, LINE, MODES, WORDS
 
 COARSE_STEPS, FINE_STEPS, POLISH_STEPS = 4, 5, 3
-COARSE_SAMPLES, FINE_SAMPLES, POLISH_SAMPLES = 120, 240, 800
+COARSE_SAMPLES, FINE_SAMPLES, POLISH_SAMPLES = 120, 240, 400
 FINE_RAYS, POLISH_RAYS = 120, 400
 # Of a row of the Jacobian: all points and all rays in whole vectors, and an odd number of lines of the cache.
 ROOM = LANES * (-(-POLISH_SAMPLES // LANES) - (-POLISH_RAYS // LANES)) + LINE

@@ -133,11 +133,15 @@ def test_output_files_hold_what_json_prints(recording: Path, anything: Path, tmp
     headvox("run", recording, "--cascade", anything, "-o", tmp_path / "out.csv")
     header, *rows = (tmp_path / "out.csv").read_text().splitlines()
     assert header.startswith("frame,stamp_ns,latency_ms,id,x,y,z,")
-    heads = heads_of(done.stdout)
-    assert len(rows) == sum(len(frame) for frame in heads)
-    first = dict(zip(header.split(","), rows[0].split(","), strict=True))
-    assert [float(first[axis]) for axis in "xyz"] == heads[0][0]["centre"]
-    assert first["qx"] == first["id"] == first["vx"] == ""
+    told = [dict(zip(header.split(","), row.split(","), strict=True)) for row in rows]
+    heads = [head for frame in heads_of(done.stdout) for head in frame]
+    for row, head in zip(told, heads, strict=True):
+        assert [float(row[axis]) for axis in "xyz"] == head["centre"]
+        stated = [row[f"q{axis}"] for axis in "xyzw"]
+        assert stated == [""] * 4 or [float(v) for v in stated] == head["quaternion"]
+        assert (head["quaternion"] is None) == (stated == [""] * 4)
+    assert {head["quaternion"] is None for head in heads} == {True, False}
+    assert told[0]["id"] == told[0]["vx"] == ""
 
 
 def test_an_unknown_kind_of_output_is_wrong_usage(recording: Path, tmp_path: Path) -> None:

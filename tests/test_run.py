@@ -157,8 +157,11 @@ def test_to_follow_what_cannot_be_used_at_all_is_an_error(stamps: tuple[int, ...
 
 def test_what_the_caller_raises_is_his() -> None:
     told: list[str] = []
-    following = follow([Frame(0), Frame(1)], TwoHeads(), Tracker(), told.append)
-    next(following)
+
+    def fails_in_the_loop() -> None:
+        for _ in follow([Frame(0), Frame(1)], TwoHeads(), Tracker(), told.append):
+            raise HeadvoxError("mine")
+
     with pytest.raises(HeadvoxError, match="mine"):
-        following.throw(HeadvoxError("mine"))  # type: ignore[attr-defined]
+        fails_in_the_loop()
     assert told == []

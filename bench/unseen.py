@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from headvox.config import DetectorConfig
-from headvox.data import F64
+from headvox.data import F64, Cloud, Frame
 from headvox.evolve.check import LEAST_SCORE, Outcome, points_of, scores_in
 from headvox.evolve.samples import RANGE_M, to_find
 from headvox.evolve.views import KINDS, View, keep_view
-from headvox.frames import inverse, transform
+from headvox.frames import inverse, placed, transform
 from headvox.masks.read import load_cascade
 from headvox.pipeline import Detector
 from headvox.synth.scene import POSTURES
@@ -32,6 +32,7 @@ ORDINARY_POSTURES = ("standing", "walking", "sitting")
 CLEAR_SHARE, CLEAR_M = 0.3, 4.0
 RANGES_M, SHARES = (0.0, 1.0, 2.0, 3.0, 4.0, RANGE_M), (0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST = 10  # heads, of which a share is told
+TURNED = placed((0.0, 0.0, 0.0), (0.2, 0.4, 0.5, 0.7416198487095663))  # about no axis of a camera
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,8 @@ def look(folder: Path, seed: int, views: int, detector: Detector, clouds: str | 
         if KINDS[number % len(KINDS)] in ("bodies", "shell"):
             continue  # clouds
         view = keep_view(folder, seed, number)
-        frame = view.frame if clouds is None else points_of(view.frame, in_world=clouds == "world")
-        scores = scores_in(view, detector, frame)
+        frame = frame_of(view, clouds)
+        scores = None if frame is None else scores_in(view, detector, frame)
         if scores is None:
             continue
         wanted = np.flatnonzero(to_find(view)).tolist()
@@ -76,6 +77,26 @@ def look(folder: Path, seed: int, views: int, detector: Detector, clouds: str | 
         if view.kind == "nobody":
             of_nobody.append(scores[1])
     return Seen(heads, _outcome([head.score for head in heads], false), _outcome([], of_nobody))
+
+
+def frame_of(view: View, clouds: str | None) -> Frame | None:
+    """Return what is looked at of ``view``; None where there are too few cameras."""
+    frame = view.frame
+    if clouds is None:
+        return frame
+    if clouds != "beside":
+        return points_of(frame, in_world=clouds == "world")
+    others = points_of(replace(frame, depths=frame.depths[1:]), in_world=False).clouds
+    return (
+        replace(frame, clouds=tuple(map(_as_of_a_lidar, others)), depths=frame.depths[:1]) if others else None
+    )
+
+
+def _as_of_a_lidar(cloud: Cloud) -> Cloud:
+    """Return ``cloud`` in a turned frame, in which its points are on the rays of no pinhole camera."""
+    assert cloud.T_world_sensor is not None
+    points = transform(TURNED, cloud.points).astype(np.float32)
+    return replace(cloud, points=points, T_world_sensor=cloud.T_world_sensor @ inverse(TURNED))
 
 
 def _outcome(heads: list[float], false: list[F64]) -> Outcome:
@@ -168,7 +189,9 @@ def main() -> None:
     parser.add_argument("--cascade", default="default")
     parser.add_argument("--refine", default="pose", choices=("pose", "sphere"))
     parser.add_argument(
-        "--clouds", choices=("world", "camera"), help="points instead of images, in the frame of one of these"
+        "--clouds",
+        choices=("world", "camera", "beside"),
+        help="points instead of images, in the frame of one of these; or instead of all images but the first",
     )
     args = parser.parse_args()
     config = DetectorConfig(cascade=args.cascade, max_range_m=RANGE_M, refine=args.refine)

@@ -1,9 +1,11 @@
 """Two heads on shoulders as detectors of small regions see them, and the bytes of what these find."""
 
+from dataclasses import replace
+
 import numpy as np
 import scenes
 
-from headvox import Frame, Heads
+from headvox import Cloud, Frame, Heads
 
 SMALL = {
     "max_range_m": 0.7,
@@ -24,6 +26,19 @@ def two_busts(seed=0):
     return np.concatenate(
         [scenes.bust(rng, (-0.25, -0.2, 0.1), 400), scenes.bust(rng, (0.25, 0.25, 0.15), 400)]
     )
+
+
+def camera_and_cloud():
+    """A camera without any return on its right, where a cloud has a bust; another bust is in both."""
+    frame = camera_frame(1)
+    image = frame.depths[0]
+    depth = image.depth.copy()
+    depth[:, depth.shape[1] // 2 :] = 0
+    rng = np.random.default_rng(0)
+    cloud = np.concatenate(
+        [scenes.bust(rng, (-0.2, 0.25, 0.1), 100), scenes.bust(rng, (-0.2, -0.2, 0.1), 100)]
+    )
+    return Frame(0, clouds=(Cloud("c", cloud),), depths=(replace(image, depth=depth),))
 
 
 def camera_frame(seed=0, count=1):

@@ -20,8 +20,8 @@ from naive_search import (
     suppress_overlaps,
 )
 from naive_sphere import fit_spheres
-from naive_visibility import States
-from naive_voxels import Grid, lattice_over
+from naive_visibility import States, is_seen
+from naive_voxels import Grid, about, lattice_over, voxel_box
 
 from headvox.data import Frame
 from headvox.fuse import Region
@@ -71,13 +71,19 @@ def detect(frame: Frame, cascade: Cascade, region: Region, min_score: float | No
     asks = {
         n.rsplit(".", 1)[0] for stage in cascade.judge for tree in stage.trees for n in names_in(tree)
     } & seeing
-    sees = bool(asks) and bool(frame.depths) and not frame.clouds
+    sees = bool(asks) and bool(frame.depths)
     cells, scores = candidates[peaks], scores[peaks]
     if cascade.judge:
         cells, scores = best_about(amount, cells, cascade, voxel)
         if sees:
-            states = States(frame.depths, lattice)
+            states, by_occupancy = States(frame.depths, lattice), scores
             scores = [score_by_stages(amount, cell, cascade, voxel, states, judge=True) for cell in cells]
+            if frame.clouds:
+                more = round((cascade.min_score - cascade.min_score_occupied) * SCORE_UNIT)
+                boxes = [box for group in cascade.groups if group.name in asks for box in group.boxes]
+                for k, cell in enumerate(cells):
+                    if not is_seen(states, [about(cell, voxel_box(box, voxel)) for box in boxes]):
+                        scores[k] = by_occupancy[k] + more
     scores = np.array(scores, np.int64)
     if min_score is None:
         min_score = cascade.min_score if sees or not asks else cascade.min_score_occupied

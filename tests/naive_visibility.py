@@ -62,6 +62,13 @@ def count_in(states: States, box) -> tuple[int, int]:
     return found.count("empty"), found.count("hidden")
 
 
+def is_seen(states: States, boxes) -> bool:
+    """Return whether a sixteenth of the cells in ``boxes`` was seen empty; those in two of them count twice."""
+    counts = [np.array([count_in(states, box)[0], np.prod(np.diff(box)[::2])]) for box in boxes]
+    empty, cells = sum(counts)
+    return bool(empty / cells >= 1 / 16)
+
+
 def count_seen(images, lattice: Lattice, cells, boxes) -> np.ndarray:
     states = States(images, lattice)
     rows = [[count_in(states, about(cell, box)) for box in boxes] for cell in cells]

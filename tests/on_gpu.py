@@ -44,7 +44,7 @@ from headvox.lattice import Lattice
 from headvox.masks.compile import compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade
 from headvox.suppress import suppress as suppress_on_cpu
-from headvox.visibility import cells_of, count_seen
+from headvox.visibility import EMPTY, HIDDEN, cells_of, count_seen, not_seen
 from headvox.vote import DROPPED, score_by_stages, seen_boxes
 from headvox.voxelize import Rays, voxelize_depth, voxelize_points
 
@@ -221,8 +221,11 @@ def some_cells(rng, shape, count):
     return np.unique(np.concatenate([corner, rng.choice(cells, count)]), axis=0).astype(np.int32)
 
 
-def scores_on_device(cells, places, stages, seen, steps=((0, 0, 0),)):
-    """Return the scores of all stages, or of those that see nothing, of the voxels ``steps`` from each place."""
+def scores_on_device(cells, places, stages, seen, steps=((0, 0, 0),), asked=None):
+    """Return the scores of all stages, or of those that see nothing, of the voxels ``steps`` from each place.
+
+    Of those that are not ``asked``, seven is left.
+    """
     shape, several = cells.shape, len(places[0]) * len(steps)
     along = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1])
     sizes = vote.Sizes.of(stages)
@@ -230,10 +233,11 @@ def scores_on_device(cells, places, stages, seen, steps=((0, 0, 0),)):
     whole = np.zeros((1, readings.HEADER), np.int32)
     whole[0, readings.SEES] = seen is not None
     looked = np.zeros((1, 1, 1, 2), np.int32) if seen is None else seen[None]
+    asked = np.full(several, True) if asked is None else asked
     scores = cuda.to_device(np.full((1, several), 7))
     vote.vote_stages[(2, 1), search.THREADS](
         volume_of(cells), *to_device(whole, places, (np.array(steps) @ along).astype(np.int32)),
-        counts_with(0, len(places[0])), 0, table, *to_device(looked), seen is not None,
+        counts_with(0, len(places[0])), 0, table, *to_device(looked, asked[None]), seen is not None,
         stages.occupied_stages if seen is None else len(stages.stage_keep),
         zeros(2, sizes.boxes, dtype=np.int64), zeros(2, sizes.features, dtype=np.int64), scores,
     )  # fmt: skip
@@ -387,3 +391,30 @@ def test_the_cameras_saw_the_same():
     np.testing.assert_array_equal(seen.copy_to_host()[0], wanted)
     assert wanted[..., 0].sum() > 20
     assert wanted[..., 1].sum() > 20
+
+
+@pytest.mark.parametrize("sees", [readings.OF_ALL, readings.OF_SEEN])
+def test_the_cameras_are_asked_of_the_same_peaks(sees):
+    rng = np.random.default_rng(13)
+    states = rng.choice(3, (1, 9, 48), p=[0.6, 0.35, 0.05]).astype(np.uint8)
+    states[0, 0], states[0, 1, :3], states[0, 1, 3:] = HIDDEN, EMPTY, HIDDEN
+    whole = np.zeros((1, readings.HEADER), np.int32)
+    whole[0, readings.SEES] = sees
+    asked, scores = zeros(1, 9, dtype=np.bool_), cuda.to_device(np.arange(9)[None])
+    counts = counts_with(suppress.JUDGED, 9)
+    judge.ask_of[on()](*to_device(whole), counts, *to_device(states), -100, asked, scores)
+    unseen = not_seen(states[0]) & (sees == readings.OF_SEEN)
+    np.testing.assert_array_equal(asked.copy_to_host()[0], ~unseen)
+    np.testing.assert_array_equal(scores.copy_to_host()[0], np.arange(9) - 100 * unseen)
+    assert not_seen(states[0])[:2].tolist() == [True, False]  # three of 48 are just enough
+
+
+def test_of_what_is_not_asked_nothing_changes():
+    rng = np.random.default_rng(14)
+    grid = random_parts(rng, (9, 8, 7))
+    cells, stages = some_cells(rng, grid.shape, 12), compile_cascade(STAGES).judge
+    asked = np.arange(len(cells)) % 3 > 0
+    seen = rng.integers(0, 12, (len(cells), len(seen_boxes(stages)[0]), 2)).astype(np.int32)
+    wanted = np.where(asked, score_by_stages(integral_volume(grid), cells, stages, seen), 7)
+    got = scores_on_device(grid, places_of(cells, grid.shape), stages, seen, asked=asked)
+    np.testing.assert_array_equal(got, wanted)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scenes
-from busts import NARROW, SMALL, camera_frame, two_busts
+from busts import NARROW, SMALL, camera_and_cloud, camera_frame, two_busts
 from gpu_arrays import (
     METRES,
     RADIANS,
@@ -72,11 +72,9 @@ def same(one, other, verified=False):
 
 
 def frames_of_all_kinds():
-    cloud = scenes.bust(np.random.default_rng(0), (-0.2, -0.2, 0.1), 100)
-    camera = camera_frame(1)
     return {
         "two cameras": ("stages", camera_frame(2, 2), {"min_score": -2.0}),
-        "a camera and a cloud": ("stages", replace(camera, clouds=(Cloud("c", cloud),)), {}),
+        "a camera and a cloud": ("stages", camera_and_cloud(), {"min_score": -2.0}),
         "every fourth voxel": ("fourth", Frame(0, clouds=(Cloud("c", two_busts()),)), {"min_score": -1.0}),
         "votes": ("votes", Frame(0, clouds=(Cloud("c", two_busts()),)), {"min_score": 0.0, "voxel_m": 0.06}),
     }

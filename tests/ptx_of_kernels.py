@@ -25,7 +25,7 @@ from headvox.masks.compile import compile_cascade
 from headvox.masks.read import load_cascade, parse_cascade
 from headvox.suppress import AROUND
 
-KERNELS = 23
+KERNELS = 24
 MOST_THREADS, REGISTERS = 256, 1 << 16  # of a block
 FITS = {"fit_spheres", "gather", "fit_starts", "settle_heads"}  # within a tolerance of the CPU's
 

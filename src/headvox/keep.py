@@ -30,8 +30,13 @@ class Judged(NamedTuple):
 
 
 def asks_cameras(frame: Frame, sees: bool) -> bool:
-    """Return whether a cascade that ``sees`` can ask the cameras: not with clouds, of which nobody knows the rays."""
-    return sees and len(frame.depths) > 0 and not frame.clouds
+    """Return whether a cascade that ``sees`` can ask cameras: clouds do not tell what was seen to be empty."""
+    return sees and len(frame.depths) > 0
+
+
+def shift_of_unseen(cascade: Cascade) -> int:
+    """Return what is added to the score of a peak that no camera sees, in steps: one threshold holds for all."""
+    return math.ceil(cascade.min_score * SCORE_UNIT) - math.ceil(cascade.min_score_occupied * SCORE_UNIT)
 
 
 def least_score(config: DetectorConfig, cascade: Cascade, blind: bool) -> int:

@@ -24,7 +24,7 @@ from headvox.errors import HeadvoxError
 from headvox.frames import as_rigid
 from headvox.gate import gate_columns, list_passed, shape_of_passed
 from headvox.integral import integrate, set_corners
-from headvox.keep import Judged, asks_cameras, keep, least_before, least_score, slack_of
+from headvox.keep import Judged, asks_cameras, keep, least_before, least_score, shift_of_unseen, slack_of
 from headvox.machine.clock import Clock
 from headvox.machine.kernels import read_only
 from headvox.machine.threads import Threads, new_blocks
@@ -40,7 +40,7 @@ from headvox.relief import look_again
 from headvox.slabs import shares_of
 from headvox.suppress import AROUND, MOST_PEAKS, PEAK_REACH, best_of_each, local_maxima
 from headvox.verify import verify
-from headvox.visibility import count_states, look_about
+from headvox.visibility import count_states, look_about, not_seen
 from headvox.vote import DROPPED, vote_masks, vote_stages
 from headvox.voxelize import NO_BOX, empty, join_boxes, mark_depth, mark_points
 
@@ -394,7 +394,10 @@ class Detector:
     def _look_about(
         self, frame: Frame, S: npt.NDArray[Any], cells: I32, judge: Stages, memory: Memory, scores: I64
     ) -> None:
-        """Go on to score by the stages of the judge that ask what the cameras saw empty and hidden."""
+        """Go on to score by the stages of the judge that ask what the cameras saw empty and hidden.
+
+        A cloud may have put something where no camera looks: these stages have no say there.
+        """
         states = np.zeros((len(cells), judge.offsets.shape[1]), np.uint8)
         in_lattice = cells + memory.first.astype(np.int32)
         seen = np.empty((len(cells), len(judge.offset_start) - 1, 2), np.int32)
@@ -411,7 +414,11 @@ class Detector:
         shares = shares_of(len(cells), 1 if len(cells) < FEW_PEAKS else self._threads.count)
         calls = [(in_lattice[low:high], states[low:high], seen[low:high]) for _, low, high in shares]
         self._threads.run(look, calls)
+        by_occupancy = scores + shift_of_unseen(self.cascade.source)
         self._score(S, cells, seen, judge, judge.seeing, memory, scores)
+        if frame.clouds:
+            unseen = not_seen(states)
+            scores[unseen] = by_occupancy[unseen]
 
     def _refine(self, frame: Frame, judged: Judged, memory: Memory, expected: Expected | None) -> Heads:
         """Fit spheres, take the best of those that overlap, look again pixel by pixel, fit poses, and verify."""

@@ -20,6 +20,7 @@ from headvox.lattice import Lattice
 from headvox.machine.kernels import bare_kernel, kernel, product, read_only, rule
 
 HIDDEN, EMPTY = 1, 2
+LEAST_EMPTY = 16  # a camera that sees a place saw one in so many of the cells about it to be empty
 NEAREST_M = 0.1  # a cell closer to the camera than this projects to nowhere useful
 
 # What may be seen of the place where a head should be; of several cameras the highest counts.
@@ -118,6 +119,15 @@ def count_states(states, start, seen):
                 hidden += states[i, k] == HIDDEN
             seen[i, b, 0] = empty
             seen[i, b, 1] = hidden
+
+
+def not_seen(states: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+    """Return which candidates no camera sees (N,): hardly a cell about them was seen to be empty.
+
+    ``states`` (N, M) are those of :func:`look_about`. Only a cloud can have put something there.
+    """
+    unseen: npt.NDArray[np.bool_] = LEAST_EMPTY * np.count_nonzero(states == EMPTY, axis=1) < states.shape[1]
+    return unseen
 
 
 @kernel

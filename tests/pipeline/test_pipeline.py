@@ -6,12 +6,13 @@ import naive
 import numpy as np
 import pytest
 import scenes
-from busts import NARROW, camera_frame, everything, two_busts
+from busts import NARROW, camera_and_cloud, camera_frame, everything, two_busts
 
-from headvox import Cloud, Frame, Heads
+from headvox import Cloud, Frame, Heads, pipeline
 from headvox.data import Expected
 from headvox.fuse import Region
 from headvox.masks.read import load_cascade
+from headvox.visibility import not_seen
 
 
 def same_heads(heads: Heads, wanted: naive.Found):
@@ -59,6 +60,37 @@ def test_clouds_and_depth_images_in_one_frame(make, cascades):
     wanted = naive.detect(frame, load_cascade(cascades["stages"]), REGION)
     same_heads(make(**NARROW).detect_frame(frame), wanted)
     assert len(wanted.scores) > 0
+
+
+def test_cameras_have_a_say_only_where_they_look(make, cascades, monkeypatch):
+    asked = []
+
+    def noting(states):
+        asked.append(not_seen(states))
+        return asked[-1]
+
+    monkeypatch.setattr(pipeline, "not_seen", noting)
+    frame = camera_and_cloud()
+    wanted = naive.detect(frame, load_cascade(cascades["stages"]), REGION, -2.0)
+    same_heads(make(min_score=-2.0, **NARROW).detect_frame(frame), wanted)
+    assert len(wanted.scores) > 1
+    (unseen,) = asked
+    assert unseen.any()
+    assert not unseen.all()
+
+
+def test_where_no_camera_looks_a_cloud_counts_as_without_any(make):
+    """But for the threshold: one holds for all heads of a frame."""
+    cloud, image = (Cloud("c", two_busts()),), camera_frame(1).depths[0]
+    blind = replace(image, depth=np.zeros_like(image.depth))
+    detector = make(min_score=-2.0)
+    alone = detector.detect_frame(Frame(0, clouds=cloud))
+    both = detector.detect_frame(Frame(0, clouds=cloud, depths=(blind,)))
+    assert len(alone) > 1
+    assert both.scores.tolist() == (alone.scores - 0.25).tolist()  # 0.5 is the least score without, 0.25 with
+    finder = make()
+    assert len(finder.detect_frame(Frame(0, clouds=cloud))) == (alone.scores >= 0.5).sum() > 0
+    assert len(finder.detect_frame(Frame(0, clouds=cloud, depths=(blind,)))) == (alone.scores >= 0.5).sum()
 
 
 def test_without_refinement_a_head_is_at_its_voxel(make):

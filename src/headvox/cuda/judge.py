@@ -14,6 +14,8 @@ from headvox.cuda.readings import (
     HEADER,
     HEIGHT,
     KIND,
+    OF_NONE,
+    OF_SEEN,
     SEES,
     SENSOR,
     SENSORS,
@@ -23,7 +25,7 @@ from headvox.cuda.readings import (
 from headvox.cuda.suppress import CANDIDATES, HEADS, JUDGED, PEAKS
 from headvox.data import F64
 from headvox.pose.fit import Poses
-from headvox.visibility import EMPTY, HIDDEN, pixel_of, project, state_at
+from headvox.visibility import EMPTY, HIDDEN, LEAST_EMPTY, pixel_of, project, state_at
 from headvox.vote import DROPPED
 
 _pixel_of = on_device(pixel_of, project=on_device(project, product=product_32), floored=floored)
@@ -76,7 +78,7 @@ def keep_best(counts, steps, about_scores, peaks, peak_places, best, judged, jud
 def look_about(S, whole, quads, half, counts, judged_places, offsets, states):
     """Write what the cameras saw of the cells about each judged peak to ``states`` (frames, most, offsets)."""
     frame, cells = cuda.blockIdx.y, offsets.shape[0]
-    if whole[frame, SEES] == 0:
+    if whole[frame, SEES] == OF_NONE:
         return
     volume = S[frame]
     for i in range(cuda.grid(1), counts[frame, JUDGED] * cells, cuda.gridsize(1)):
@@ -107,7 +109,7 @@ def look_about(S, whole, quads, half, counts, judged_places, offsets, states):
 def count_states(whole, counts, states, start, seen):
     """Count the EMPTY and the HIDDEN cells of each box about each judged peak: ``seen`` (frames, most, boxes, 2)."""
     frame, boxes = cuda.blockIdx.y, seen.shape[2]
-    if whole[frame, SEES] == 0:
+    if whole[frame, SEES] == OF_NONE:
         return
     for i in range(cuda.grid(1), counts[frame, JUDGED] * boxes, cuda.gridsize(1)):
         n, b = i // boxes, i % boxes
@@ -118,6 +120,22 @@ def count_states(whole, counts, states, start, seen):
             hidden += states[frame, n, k] == HIDDEN
         seen[frame, n, b, 0] = empty
         seen[frame, n, b, 1] = hidden
+
+
+@kernel
+def ask_of(whole, counts, states, shift, asked, judged_scores):
+    """Write of which judged peaks the cameras are ``asked`` (frames, most): see :func:`headvox.visibility.not_seen`.
+
+    To the ``judged_scores`` of the others ``shift`` is added: :func:`headvox.keep.shift_of_unseen`.
+    """
+    frame, cells = cuda.blockIdx.y, states.shape[2]
+    for n in range(cuda.grid(1), counts[frame, JUDGED], cuda.gridsize(1)):
+        empty = 0
+        for k in range(cells):
+            empty += states[frame, n, k] == EMPTY
+        asked[frame, n] = whole[frame, SEES] != OF_SEEN or LEAST_EMPTY * empty >= cells
+        if not asked[frame, n]:
+            judged_scores[frame, n] += shift
 
 
 @kernel

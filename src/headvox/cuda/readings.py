@@ -5,7 +5,7 @@ Uploaded is everything that the sensors saw in a frame, and where they stand, in
 A row is read as int32, float32, float64 and uint16 at once; offsets are numbers of items of the type that lies there.
 4x4 matrices begin at whole quads of words, and expected heads at whole octets of float64.
 
-    header    how many sensors, whether the cameras are asked what they saw, the parity of cell 0, 0, 0, the least score
+    header    how many sensors, of which peaks the cameras are asked, the parity of cell 0, 0, 0, the least score
               that is worth a look in two words, the limits of the region, the least score of a head in two words, where
               the expected heads are and how many, whether heads have hair, and the lattice's origin
     sensors   a record each: what it is, where its readings and rays begin, its size, whether it is where its readings
@@ -49,6 +49,7 @@ KIND, DATA, WIDTH, HEIGHT, COLUMN, ROW, KNOWS, TRANSFORM, TABLE, PLACE, LENS = (
 SENSOR = 76
 OCTET = 16  # words of an expected head
 NOTHING, CLOUD, DEPTH = 0, 1, 2
+OF_NONE, OF_ALL, OF_SEEN = 0, 1, 2  # the cameras are asked of these peaks
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ def pack(asked: Asked, rays_of: Callable[[DepthImage, Lattice], Rays], row: I32)
     frame, lattice = asked.frame, asked.lattice
     real, wide, half = row.view(np.float32), row.view(np.float64), row.view(np.uint16)
     row[SENSORS] = len(frame.clouds) + len(frame.depths)
-    row[SEES] = asked.sees
+    row[SEES] = OF_NONE if not asked.sees else OF_SEEN if frame.clouds else OF_ALL
     row[ODD : ODD + 3] = lattice.odd
     row[THRESHOLD : THRESHOLD + 2] = np.array([asked.least - asked.slack], np.int64).view(np.int32)
     row[LEAST : LEAST + 2] = np.array([asked.least], np.int64).view(np.int32)

@@ -23,6 +23,7 @@ from headvox.cuda.lanes import SIMULATED
 from headvox.cuda.readings import OCTET, Asked, Found, pack, words_of
 from headvox.data import I32, I64, DepthImage
 from headvox.gate import gate_tables
+from headvox.keep import shift_of_unseen
 from headvox.lattice import Lattice
 from headvox.masks.compile import CompiledCascade, CompiledStages
 from headvox.suppress import PEAK_REACH
@@ -120,12 +121,14 @@ class Search:
         self.judged, self.judged_places = self._empty(most, np.int32), self._empty(most, np.int32)
         self.judged_scores = self._empty(most, np.int64)
         self.unseen = cuda.to_device(np.zeros((self.frames, 1, 1, 2), np.int32))
+        self.asked = self._empty(most, np.bool_)
         boxes = seen_boxes(cascade.judge)[0] if cascade.judge else np.zeros((0, 6), np.int32)
         offsets, start = cells_of(boxes)
         self.sees = len(offsets) > 0
         if self.sees:
             self.offsets, self.start = cuda.to_device(offsets), cuda.to_device(start)
             self.states = cuda.device_array((self.frames, most, len(offsets)), np.uint8)
+            self.shift = shift_of_unseen(cascade.source)
             self.seen = cuda.device_array((self.frames, most, len(boxes), 2), np.int32)
 
     # ------------------------------------------------------------------------------------------------ the frames
@@ -234,8 +237,8 @@ class Search:
         frames: int,
     ) -> None:  # fmt: skip
         vote.vote_stages[(STAGE_BLOCKS, frames), THREADS, self.stream](
-            self.S, self.whole, places, steps, self.counts, which, table, seen, sees, to_stage, self.sums,
-            self.features, scores,
+            self.S, self.whole, places, steps, self.counts, which, table, seen, self.asked, sees, to_stage,
+            self.sums, self.features, scores,
         )  # fmt: skip
 
     def _suppress(self, frames: int) -> None:
@@ -286,6 +289,9 @@ class Search:
         )
         judge.count_states[self.on(self.most_peaks, frames)](
             self.whole, self.counts, self.states, self.start, self.seen
+        )
+        judge.ask_of[self.on(self.most_peaks, frames)](
+            self.whole, self.counts, self.states, self.shift, self.asked, self.judged_scores
         )
         self._score(
             self.judged_places, self.stay, suppress.JUDGED, self.judge, len(stages.stage_keep), self.seen, True,

@@ -17,7 +17,7 @@ from numba import cuda
 from headvox.cuda.blocks import sum_of_all
 from headvox.cuda.gate import cell_of
 from headvox.cuda.lanes import LANE_WISE, device, kernel, on_device, product_64, sum_about_voxel
-from headvox.cuda.readings import SEES
+from headvox.cuda.readings import OF_NONE, SEES
 from headvox.masks.compile import CompiledStages, CompiledVotes
 from headvox.vote import DROPPED, FEATURES_PER_GROUP, StageTables, order, rank, statistics_of, votes_at
 
@@ -60,13 +60,15 @@ def leaf_of(tree, root, depth, nodes, features):
 
 
 @kernel
-def vote_stages(S, whole, places, steps, counts, which, table, seen, sees, to_stage, sums, features, scores):
+def vote_stages(
+    S, whole, places, steps, counts, which, table, seen, asked, sees, to_stage, sums, features, scores
+):
     """Write the scores of the first ``to_stage`` stages to ``scores`` (frames, N): DROPPED where a stage says so.
 
     Candidate i is ``steps[i % len(steps)]`` from the place ``places[:, i // len(steps)]``; ``counts[:, which]`` places
     are there. ``table`` is that of :func:`stages_table`. ``seen`` (frames, N, boxes, 2) tells how many cells of a box
-    are known-empty and hidden; with ``sees``, frames that were not to be seen are left alone. ``sums`` and
-    ``features`` are working memory, a row a block.
+    are known-empty and hidden; with ``sees``, the frames and the candidates of which no camera is ``asked`` (frames, N)
+    are left alone. ``sums`` and ``features`` are working memory, a row a block.
     """
     totals = cuda.shared.array(MOST_THREADS, np.int64)
     (
@@ -74,7 +76,7 @@ def vote_stages(S, whole, places, steps, counts, which, table, seen, sees, to_st
         stage_trees, stage_keep,
     ) = table  # fmt: skip
     frame, thread, threads = cuda.blockIdx.y, cuda.threadIdx.x, cuda.blockDim.x
-    if sees and whole[frame, SEES] == 0:
+    if sees and whole[frame, SEES] == OF_NONE:
         return
     volume = S[frame]
     block = frame * cuda.gridDim.x + cuda.blockIdx.x
@@ -82,6 +84,8 @@ def vote_stages(S, whole, places, steps, counts, which, table, seen, sees, to_st
     each = steps.shape[0]
     candidates = min(counts[frame, which], places.shape[1]) * each
     for i in range(cuda.blockIdx.x, candidates, cuda.gridDim.x):
+        if sees and not asked[frame, i]:
+            continue
         x, y, z = cell_of(places[frame, i // each] + steps[i % each], volume)
         score = np.int64(0)
         for stage in range(to_stage):

@@ -32,6 +32,8 @@ def callback():
 
 @pytest.mark.parametrize("swallows", [finalizer, callback], ids=["finalizer", "callback"])
 def test_an_interrupt_that_is_swallowed_comes_again(swallows, capsys):
+    began = time.monotonic()
+
     def work():
         with heeded():
             swallows()
@@ -39,6 +41,7 @@ def test_an_interrupt_that_is_swallowed_comes_again(swallows, capsys):
 
     with pytest.raises(KeyboardInterrupt):
         work()
+    assert time.monotonic() - began < 30.0  # it does not sleep to its end
     assert capsys.readouterr().err == ""
 
 
@@ -73,6 +76,8 @@ def test_sigterm_ends_as_ctrl_c_does_even_where_that_is_ignored_and_it_is_swallo
         def __del__(self):
             signal.raise_signal(signal.SIGTERM)
 
+    began = time.monotonic()
+
     def work():
         with heeded():
             Ended()
@@ -83,5 +88,6 @@ def test_sigterm_ends_as_ctrl_c_does_even_where_that_is_ignored_and_it_is_swallo
     with terminable() as came, pytest.raises(Terminated):
         work()
     assert came == [signal.SIGTERM, signal.SIGTERM]
+    assert time.monotonic() - began < 30.0  # it does not sleep to its end
     assert signal.getsignal(signal.SIGTERM) is before
     assert capsys.readouterr().err == ""

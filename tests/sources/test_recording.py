@@ -267,6 +267,22 @@ def test_what_is_no_recording_json_is_refused_in_one_line(tmp_path, text, messag
     assert "\n" not in str(error.value)
 
 
+def test_what_is_said_of_a_camera_and_not_read_is_told(tmp_path):
+    content = recording(tmp_path)
+    content["cameras"]["left"].update(model="D435", distortion=[0.0, 0.0], binning=0)
+    told: list[str] = []
+    write_json(tmp_path, content)
+    open_source(tmp_path, None, told.append)
+    content["cameras"]["right"].update(
+        distortion=[-0.05, 0.06], **{"\x1b[2J": 1, "T_camera": LIFTED, "note": "x"}
+    )
+    write_json(tmp_path, content)
+    open_source(tmp_path, None, told.append)
+    assert "is not read: 'model'; images are taken to be those of pinhole cameras" in told[0]
+    assert "is not read: 'model', 'distortion', '\\x1b[2J', 'T_camera', ..; images" in told[1]
+    assert len(told) == 2
+
+
 def test_names_from_the_file_cannot_steer_a_terminal(tmp_path):
     content = recording(tmp_path)
     content["frames"][1]["depth"]["\x1b[2J\nleft"] = "a.png"

@@ -42,6 +42,15 @@ def terminable() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _signal_main(number: signal.Signals) -> None:
+    """Send a signal to the main thread, so that it wakes where it waits; where none can be sent, it heeds it later."""
+    main = threading.main_thread().ident
+    if sys.platform == "win32" or main is None:
+        _thread.interrupt_main(number)
+    else:
+        signal.pthread_kill(main, number)
+
+
 @contextmanager
 def heeded() -> Iterator[None]:
     """Interrupt again, in a moment, where Python swallows a KeyboardInterrupt: in finalizers, and in callbacks from C.
@@ -58,7 +67,7 @@ def heeded() -> Iterator[None]:
     def interrupt_again(unraisable: Any) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
             number = signal.SIGTERM if unraisable.exc_type is Terminated else signal.SIGINT
-            due.append(threading.Timer(AGAIN_S, _thread.interrupt_main, [number]))
+            due.append(threading.Timer(AGAIN_S, _signal_main, [number]))
             due[-1].start()
         else:
             before(unraisable)

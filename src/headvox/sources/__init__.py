@@ -55,8 +55,8 @@ def open_source(
         path: of a file or a folder, or ``realsense:``.
         options: what a bag or a camera does not tell by itself; a depth recording takes ``extrinsics``, clouds in
             files ``T_world_mount``, and a folder of them ``rate_hz``.
-        say: told what is assumed about a bag or a cloud, or overruled in a recording, a line each; by default these
-            are warnings.
+        say: told what is assumed about a bag or a cloud, or overruled or not read in a recording, a line each; by
+            default these are warnings.
 
     Returns:
         A source: it yields each :class:`~headvox.data.Frame` once, in time order, and a
@@ -107,15 +107,19 @@ def _mounting(options: SourceOptions, say: Callable[[str], None]) -> Mounting:
 
 def _open_recording(folder: Path, options: SourceOptions | None, say: Callable[[str], None]) -> Source:
     from headvox.sources.extrinsics import read_extrinsics
-    from headvox.sources.options import check_unused
+    from headvox.sources.options import SourceOptions, check_unused
     from headvox.sources.recording import RecordingSource
 
-    if options is None or options.extrinsics is None:
-        check_unused(options, folder.name)
-        return RecordingSource(folder)
+    options = options or SourceOptions()
     check_unused(replace(options, extrinsics=None), folder.name)
-    placed = read_extrinsics(options.extrinsics)
+    placed = {} if options.extrinsics is None else read_extrinsics(options.extrinsics)
     source = RecordingSource(folder, placed)
+    if source.unread:
+        some = ", ".join(source.unread[:4]) + (", .." if len(source.unread) > 4 else "")
+        say(
+            f"{folder.name}: recording.json says of a camera what is not read: {some}; images are taken to be those "
+            "of pinhole cameras without distortion"
+        )
     frozen = [camera for camera in source.moving() if camera in placed]
     if frozen:
         say(

@@ -18,6 +18,9 @@ from headvox.frames import as_rigid, is_moving
 
 FILE = "recording.json"
 FORMAT, VERSION = "headvox-recording", 1
+LENS = ("fx", "fy", "cx", "cy", "depth_scale")
+KEYS = {"width", "height", *LENS, "T_world_camera"}
+"""What is read of a camera."""
 _MAX_JSON_BYTES = 64 << 20
 _MAX_PIXELS = 8_000_000  # eight times the largest depth sensor
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -70,6 +73,8 @@ class RecordingSource:
         self._folder = folder.resolve()
         _check_version(content, name)
         self.cameras = _cameras(content, name)
+        self.unread = _unread(content["cameras"])
+        """What recording.json says of its cameras that nobody reads: distortion, for example."""
         self.frames = _frames(content, self.cameras, name)
         self.length = len(self.frames)
         self._placed = dict(placed or {})
@@ -219,9 +224,7 @@ def _camera(entry: Any, name: str) -> Camera:
             f"{name}: the size is {_short(width)}x{_short(height)}, expected 1x1 to {_MAX_PIXELS} pixels.",
             "Give width and height of the depth image in pixels.",
         )
-    fx, fy, cx, cy, scale = (
-        _number(_get(camera, key, name), f"{name}: {key}") for key in ("fx", "fy", "cx", "cy", "depth_scale")
-    )
+    fx, fy, cx, cy, scale = (_number(_get(camera, key, name), f"{name}: {key}") for key in LENS)
     for key, value in (("fx", fx), ("fy", fy)):
         if not value > 0.0:
             raise HeadvoxError(f"{name}: {key} is {value}, expected more than 0.", "Give it in pixels.")
@@ -235,6 +238,17 @@ def _camera(entry: Any, name: str) -> Camera:
         Intrinsics(width, height, fx, fy, cx, cy, scale),
         None if pose is None else _pose(pose, f"{name}: T_world_camera"),
     )
+
+
+def _unread(cameras: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the keys of cameras that nobody reads; those that say nothing, or only zeros, are left out."""
+    said = {
+        key: None
+        for camera in cameras.values()
+        for key, value in camera.items()
+        if key not in KEYS and (any(value) if isinstance(value, list) else value)
+    }
+    return [_short(key) for key in said]
 
 
 def _frames(content: Mapping[str, Any], cameras: Mapping[str, Camera], name: str) -> list[RecordedFrame]:
